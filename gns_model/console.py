@@ -1,0 +1,109 @@
+"""What every command line of the project shares: clean errors and a progress bar with time left.
+
+A user's mistake ends in one line on stderr and exit code 2, an interrupt in exit code 130; a
+traceback is kept for our own mistakes. rich and typer are imported when they are used.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, NoReturn
+
+from gns_model.errors import GnsError
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+    from typer import Typer
+
+USER_ERROR, INTERRUPTED = 2, 130
+
+
+def fail(message: str, code: int = USER_ERROR) -> NoReturn:
+    """Print one line on stderr and leave with `code`."""
+    print("error: " + " ".join(message.split()), file=sys.stderr)
+    raise SystemExit(code)
+
+
+@contextlib.contextmanager
+def clean_errors() -> Iterator[None]:
+    """Turn what a user or a machine can cause into one line and an exit code.
+
+    Works as a context manager and as a decorator of a command. GnsError, OSError (a full disk, a
+    folder that cannot be written) and MemoryError leave with 2, an interrupt with 130. Anything
+    else is a fault of ours and keeps its traceback.
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        fail("interrupted; what was finished is kept", INTERRUPTED)
+    except GnsError as error:
+        fail(str(error))
+    except BrokenPipeError:
+        # The reader of our output left (`| head`): nobody is there to be told.
+        sys.stderr.close()
+        raise SystemExit(USER_ERROR) from None
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        fail(place + (error.strerror or str(error) or type(error).__name__))
+    except MemoryError:
+        fail("out of memory: use a coarser spacing, fewer workers or a smaller batch")
+
+
+def main(app: Typer, name: str, arguments: list[str] | None = None) -> NoReturn:
+    """Run a typer app as a command: bad options too are one line and exit code 2.
+
+    A SIGTERM (a batch system that ends the job) is treated as Ctrl-C, so that the same care is
+    taken of what is half done.
+    """
+    from typer import Abort
+    from typer.exceptions import TyperException
+
+    signal.signal(signal.SIGTERM, _interrupt)
+    with clean_errors():
+        try:
+            code = app(arguments, prog_name=name, standalone_mode=False)
+        except TyperException as error:
+            message = error.format_message()
+            if "\n" in message.strip():  # no command given: typer's message is the whole help
+                print(message, file=sys.stderr)
+                raise SystemExit(USER_ERROR) from None
+            fail(f"{message} (see {name} --help)")
+        except Abort:
+            raise KeyboardInterrupt from None
+        if code == INTERRUPTED:  # typer swallows the interrupt and returns its code
+            raise KeyboardInterrupt
+    raise SystemExit(code if isinstance(code, int) else 0)
+
+
+def _interrupt(signum: int, frame: object) -> NoReturn:
+    raise KeyboardInterrupt
+
+
+def progress_bar(*, quiet: bool = False) -> Progress:
+    """A rich progress bar on stderr with time spent and time left; nothing when `quiet`.
+
+    Off a terminal (a log file, a CI job) rich prints the last state once instead of redrawing.
+    """
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+        disable=quiet,
+    )

@@ -1,0 +1,249 @@
+"""Training windows: short runs of frames, read lazily from a folder of trajectory files.
+
+The files come from the reference solver at a fine spacing; a learned model works at `ratio` times
+that spacing and `stride` times their frame interval. The points whose lattice coordinates agree
+modulo `ratio` form a lattice of the model's spacing, so every file holds ratio^D sets of tracers
+of one and the same flow: each of them is training data.
+
+A window may begin at the first frame: history before t = 0 is the release velocity extended
+backwards, exactly as a rollout of the learned simulator begins.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from gns_model.errors import FileFormatError, SceneError
+from gns_model.particles import MOVING, fill
+from gns_model.scene import Scene
+from gns_model.trajectory import OK, open_trajectory
+
+#: How far a ratio of spacings or intervals may lie from an integer.
+INTEGER_TOLERANCE = 0.01
+
+
+@dataclass(frozen=True)
+class Window:
+    """One piece of training data.
+
+    Attributes:
+        history: positions [m], oldest first, one `dt` apart, shape (N, H+1, D) float32.
+        future: the true positions [m] of the next K steps, shape (N, K, D) float32.
+        scene: what flows, and around what.
+    """
+
+    history: np.ndarray
+    future: np.ndarray
+    scene: Scene
+
+
+@dataclass(frozen=True)
+class Source:
+    """One checked trajectory file, and which of its points belong to which tracer set."""
+
+    path: Path
+    scene: Scene
+    frames: int  #: number of usable frames
+    interval: float  #: between frames [s]
+    residue: np.ndarray  #: tracer set of every point, shape (N,) uint8
+    counts: tuple[int, ...]  #: points of every release, in order
+
+    def points(self, residue: int) -> int:
+        """Number of points in a tracer set."""
+        return int(np.count_nonzero(self.residue == residue))
+
+    def initial_velocity(self) -> np.ndarray:
+        """Velocity of every point at t = 0 [m/s], shape (N, D)."""
+        velocity = np.array([r.velocity for r in self.scene.releases], dtype=np.float32)
+        return np.repeat(velocity, self.counts, axis=0)
+
+
+class WindowIndex:
+    """All windows of the trajectory files (`*.h5`) in one or more folders.
+
+    Opening checks every file but reads no frames; what stays in memory is one byte a point.
+    Trajectories that ended badly (status other than "ok") are left out and listed in `skipped`.
+
+    Args:
+        folders: where the files are; each must hold at least one.
+        spacing: of the model's points [m].
+        dt: time step of the model [s].
+        history: number of velocities that the model sees, H.
+        unroll: number of future steps in a window, K.
+
+    Raises:
+        FileFormatError: for a missing or empty folder, and, naming the file, for one that is
+            truncated or foreign, whose points are not those that its scene is filled with, or
+            whose spacing or frame interval does not divide the model's.
+    """
+
+    def __init__(
+        self,
+        folders: Sequence[str | os.PathLike[str]],
+        *,
+        spacing: float,
+        dt: float,
+        history: int,
+        unroll: int = 1,
+    ) -> None:
+        self.spacing, self.dt, self.history, self.unroll = spacing, dt, history, unroll
+        self.sources: list[Source] = []
+        self.skipped: list[Path] = []
+        for folder in map(Path, folders):
+            paths = sorted(p for p in folder.glob("*.h5") if not p.name.startswith("."))
+            if not paths:
+                raise FileFormatError(f"{folder}: no trajectory files (*.h5) in this folder")
+            for path in paths:
+                source = read_source(path, spacing=spacing)
+                if source is None:
+                    self.skipped.append(path)
+                    continue
+                self._stride(source)
+                self.sources.append(source)
+        if not self.sources:
+            raise FileFormatError(f"{folders[0]}: every trajectory in it ended badly")
+        dims = {s.scene.dim for s in self.sources}
+        if len(dims) > 1:
+            raise FileFormatError(f"{folders[0]}: 2D and 3D trajectories cannot train one model")
+        self.dim = dims.pop()
+        last = self.unroll * max(self._stride(s) for s in self.sources)
+        for source in self.sources:
+            if source.frames <= last:
+                raise FileFormatError(
+                    f"{source.path}: {source.frames} frames are too few, {unroll} steps of "
+                    f"{dt:g} s need {last + 1}"
+                )
+
+    def _stride(self, source: Source) -> int:
+        return _multiple(self.dt, source.interval, source.path, "frame interval", "s")
+
+    def residues(self, source: int) -> int:
+        """Number of tracer sets in a file, ratio^D."""
+        return int(self.sources[source].residue.max()) + 1
+
+    def starts(self, source: int, unroll: int | None = None) -> int:
+        """Number of frames in a file at which a window of `unroll` future steps can begin."""
+        steps = self.unroll if unroll is None else unroll
+        return self.sources[source].frames - steps * self._stride(self.sources[source])
+
+    def read(
+        self, source: int, frame: int, residue: int = 0, *, unroll: int | None = None
+    ) -> Window:
+        """Read one window; only the frames that it needs leave the disk.
+
+        Args:
+            source: which file, 0 to len(sources) - 1.
+            frame: the current frame, 0 to `starts(source) - 1`.
+            residue: which tracer set, 0 to `residues(source) - 1`.
+            unroll: number of future steps if it is not the index's.
+
+        Raises:
+            FileFormatError: if the file has become unreadable since it was indexed.
+        """
+        entry = self.sources[source]
+        steps = self.unroll if unroll is None else unroll
+        if not 0 <= frame < self.starts(source, steps):
+            raise IndexError(f"frame {frame} of {entry.path} has no {steps} frames after it")
+        stride = self._stride(entry)
+        chosen = np.flatnonzero(entry.residue == residue)
+        frames = frame + stride * np.arange(-self.history, steps + 1)
+        out = np.empty((len(chosen), len(frames), self.dim), dtype=np.float32)
+        try:
+            with open_trajectory(entry.path) as file:
+                positions = file["positions"]
+                for k, f in enumerate(frames):
+                    if f >= 0:
+                        out[:, k] = positions[f][chosen]
+                if frames[0] < 0:
+                    start = positions[0][chosen]
+                    velocity = entry.initial_velocity()[chosen]
+                    for k in np.flatnonzero(frames < 0):
+                        out[:, k] = start + velocity * np.float32(frames[k] * entry.interval)
+        except (OSError, KeyError, ValueError) as error:
+            if isinstance(error, FileFormatError):
+                raise
+            raise FileFormatError(f"{entry.path}: unreadable at frame {frame} ({error})") from None
+        split = self.history + 1
+        return Window(out[:, :split], out[:, split:], entry.scene)
+
+
+def read_source(path: Path, *, spacing: float) -> Source | None:
+    """Check one file against its scene; None if the simulation in it ended badly.
+
+    Raises:
+        FileFormatError: see `WindowIndex`.
+    """
+    with open_trajectory(path) as file:
+        try:
+            if file.attrs["status"] != OK:
+                return None
+            scene = _scene_of(file, path)
+            time = file["time"][()]
+            shape = file["positions"].shape
+            lattice = file["lattice"][()] if "lattice" in file else None
+            kinds = file["particle_type"][()]
+            volume = float(file.attrs["point_volume"])
+        except (KeyError, OSError, TypeError) as error:
+            raise FileFormatError(f"{path}: truncated or foreign ({error})") from None
+    if len(shape) != 3 or shape[2] != scene.dim or volume <= 0:
+        raise FileFormatError(f"{path}: positions {shape} do not fit a {scene.dim}D scene")
+    intervals = np.diff(time)
+    if len(intervals) == 0 or intervals[0] <= 0 or np.ptp(intervals) > 1e-3 * intervals[0]:
+        raise FileFormatError(f"{path}: its frames are not evenly spaced in time")
+    if (kinds != MOVING).any():
+        raise FileFormatError(f"{path}: holds points that do not move; none can be trained on")
+    file_spacing = volume ** (1 / scene.dim)
+    try:
+        points = fill(scene, file_spacing)
+    except SceneError as error:
+        raise FileFormatError(f"{path}: {error}") from None
+    if len(points.positions) != shape[1] or (
+        lattice is not None and not np.array_equal(lattice, points.lattice)
+    ):
+        raise FileFormatError(
+            f"{path}: its {shape[1]} points are not those of its scene at {file_spacing:g} m, "
+            f"which holds {len(points.positions)}"
+        )
+    ratio = _multiple(spacing, file_spacing, path, "spacing", "m")
+    residue = np.zeros(shape[1], dtype=np.int64)
+    for axis in range(scene.dim):
+        residue = residue * ratio + points.lattice[:, axis] % ratio
+    if ratio**scene.dim > 256:
+        raise FileFormatError(f"{path}: {ratio} times its spacing is too coarse a model")
+    counts = tuple(
+        len(fill(scene.model_copy(update={"releases": (release,)}), file_spacing).positions)
+        for release in scene.releases
+    )
+    return Source(
+        path=path,
+        scene=scene,
+        frames=shape[0],
+        interval=float(intervals.mean()),
+        residue=residue.astype(np.uint8),
+        counts=counts,
+    )
+
+
+def _scene_of(file: h5py.File, path: Path) -> Scene:
+    try:
+        return Scene.from_dict(json.loads(file.attrs["scene"]), source=str(path))
+    except (ValueError, SceneError) as error:
+        raise FileFormatError(f"{path}: its scene cannot be read ({error})") from None
+
+
+def _multiple(large: float, small: float, path: Path, what: str, unit: str) -> int:
+    """How often `small` goes into `large`, which must be a whole number."""
+    ratio = large / small
+    whole = round(ratio)
+    if whole < 1 or abs(ratio - whole) > INTEGER_TOLERANCE * whole:
+        raise FileFormatError(
+            f"{path}: its {what}, {small:g} {unit}, does not divide the model's, {large:g} {unit}"
+        )
+    return whole

@@ -1,0 +1,61 @@
+"""What a simulator is, and how to get one by name: the seam that the env and the searches hold."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+from gns_model.errors import SimulatorError
+from gns_model.scene import Scene
+from gns_model.trajectory import Trajectory
+
+#: Called as a rollout advances, with the fraction done, 0 to 1.
+Progress = Callable[[float], None]
+
+
+@runtime_checkable
+class Simulator(Protocol):
+    """Anything that turns scenes into trajectories."""
+
+    name: str
+
+    def rollout(
+        self, scenes: Sequence[Scene], *, progress: Progress | None = None
+    ) -> list[Trajectory]:
+        """Simulate every scene for its duration; one trajectory a scene, in order."""
+        ...
+
+    def check(self, scene: Scene) -> None:
+        """Raise SimulatorError if this simulator cannot run `scene`."""
+        ...
+
+
+def load_simulator(name: str | os.PathLike[str], device: str = "cpu", **options: Any) -> Simulator:
+    """A simulator by name.
+
+    Args:
+        name: "mpm" (the reference solver), the name of a shipped model such as "baffle-lite",
+            or the path of a checkpoint folder.
+        device: torch device of a learned simulator; the reference solver runs on the CPU.
+        options: passed on to the simulator, e.g. `spacing` for "mpm".
+
+    Raises:
+        SimulatorError: if there is no such simulator.
+        FileFormatError: if the checkpoint is truncated or is not ours.
+    """
+    if str(name) == "mpm":
+        from gns_model.mpm import MpmSimulator
+
+        return MpmSimulator(**options)
+    from gns_model.learned.checkpoint import load_model, shipped_models
+
+    shipped = shipped_models()
+    path = shipped.get(str(name), Path(name))
+    if not path.exists():
+        raise SimulatorError(
+            f"no simulator named {str(name)!r}: give mpm, {', '.join(sorted(shipped))}, or the "
+            "path of a checkpoint folder"
+        )
+    return load_model(path, device=device, **options)
