@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -45,6 +45,7 @@ class Design:
         cost: objective by the learned simulator, or None.
         verified_cost: objective by the reference solver, or None.
         origin: which part of the search proposed it.
+        status: how the solver's rollout ended, "" where it has not run.
     """
 
     key: str
@@ -55,6 +56,7 @@ class Design:
     cost: float | None = None
     verified_cost: float | None = None
     origin: str = ""
+    status: str = ""
 
 
 @dataclass
@@ -123,7 +125,7 @@ class RunResults:
                             int(number) if number is not None else index,
                             str(row.get("origin") or "search"),
                             cost,
-                            _numbers({k: row.get(k) for k in measure_names()}),
+                            _numbers({k: row.get(k) for k in measures.UNITS}),
                         )
                     )
         except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -148,9 +150,9 @@ class RunResults:
         for key in ("paper", "none"):
             design = self._design(key, self.summary.get(SUMMARY_KEYS[key]))
             if design.centres is None and key == "none":
-                design.centres = np.zeros((0, self.scene.dim - 1 if self.scene else 2))
+                design.centres = _centres([])
             if design.centres is None and key == "paper" and self.scene and self.scene.baffles:
-                design.centres = np.array([b.center for b in self.scene.baffles])
+                design.centres = _centres([b.center for b in self.scene.baffles])
             found.append(design)
         return [d for d in found if d.surrogate or d.verified or (d.key == "best" and _any(d))]
 
@@ -187,33 +189,19 @@ class RunResults:
         design.verified = _numbers(entry.get("verified") if nested else entry)
         layout = entry.get("layout")
         if isinstance(layout, list):
-            design.centres = np.array(layout, dtype=float).reshape(len(layout), -1)
+            design.centres = _centres(layout)
         design.cost = _number(entry.get("cost"))
         design.verified_cost = _number(entry.get("verified_cost"))
         design.origin = str(entry.get("origin") or "")
+        design.status = str(entry.get("verified_status") or "")
         for attribute, simulator in (("verified", SOLVER), ("surrogate", LEARNED)):
             if not getattr(design, attribute) and not key.startswith("rank-1"):
                 trajectory = self.trajectory(key, simulator)
                 if trajectory is not None:
                     setattr(design, attribute, _numbers(measures.summary(trajectory)))
                     if design.centres is None:
-                        design.centres = np.array(
-                            [b.center for b in trajectory.scene.baffles], dtype=float
-                        ).reshape(len(trajectory.scene.baffles), -1)
+                        design.centres = _centres([b.center for b in trajectory.scene.baffles])
         return design
-
-
-def measure_names() -> tuple[str, ...]:
-    """The measures of `gns_model.measures.summary`."""
-    return (
-        "runout_max",
-        "runout_p99",
-        "centroid_travel",
-        "mass_past_section",
-        "upstream_depth",
-        "overtopping",
-        "energy_dissipated",
-    )
 
 
 def _number(value: Any) -> float | None:
@@ -227,8 +215,13 @@ def _number(value: Any) -> float | None:
 def _numbers(values: Any) -> dict[str, float]:
     if not isinstance(values, dict):
         return {}
-    known = {name: _number(values.get(name)) for name in measure_names()}
+    known = {name: _number(values.get(name)) for name in measures.UNITS}
     return {name: number for name, number in known.items() if number is not None}
+
+
+def _centres(layout: Sequence[Any]) -> np.ndarray:
+    """A layout as (n, D-1), also where n is 0 and D unknown."""
+    return np.array(layout, dtype=float).reshape(len(layout), -1 if len(layout) else 2)
 
 
 def _same(a: np.ndarray | None, b: np.ndarray | None) -> bool:

@@ -30,7 +30,7 @@ from gns_model.scene import Scene
 from gns_model.trajectory import Trajectory
 
 #: Length along x of the window in which depth is read, upstream of a baffle's face [m].
-WINDOW_LENGTH = 0.10
+WINDOW_LENGTH = 0.05
 #: The depth is this quantile of the heights in the window, so that a stray grain is not a flow.
 DEPTH_QUANTILE = 0.98
 #: A window counts when it holds at least this mean depth of material [m].
@@ -261,7 +261,7 @@ def overtopping(trajectory: Trajectory) -> float:
     return float(over.mean())
 
 
-def points_inside_baffles(trajectory: Trajectory, *, slack: float = CONTACT_SLACK) -> int:
+def points_inside_baffles(trajectory: Trajectory, *, slack: float = 1e-5) -> int:
     """Points that in some frame were deeper than `slack` [m] inside a baffle: 0 is right."""
     positions = moving_positions(trajectory)
     inside = np.zeros(positions.shape[1], bool)

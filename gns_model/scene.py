@@ -21,6 +21,7 @@ value, and is read from and written to TOML.
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import tempfile
@@ -204,7 +205,10 @@ class Scene(_Part):
     def _default_gravity(cls, values: Any) -> Any:
         if isinstance(values, dict) and not values.get("gravity"):
             domain = values.get("domain")
-            lower = domain.get("lower") if isinstance(domain, dict) else getattr(domain, "lower", None)
+            if isinstance(domain, dict):
+                lower = domain.get("lower")
+            else:
+                lower = getattr(domain, "lower", None)
             if isinstance(lower, (list, tuple)):
                 dim = len(lower)
                 values = {**values, "gravity": tuple(-9.81 if i == 1 else 0.0 for i in range(dim))}
@@ -219,7 +223,10 @@ class Scene(_Part):
             raise ValueError(f"gravity needs {dim} numbers, got {self.gravity}")
         for k, release in enumerate(self.releases):
             if len(release.lower) != dim or len(release.velocity) != dim:
-                raise ValueError(f"release[{k}] needs {dim} numbers in lower, upper and velocity")
+                raise ValueError(
+                    f"release[{k}] needs {dim} numbers in lower, upper and velocity, got "
+                    f"{release.lower}, {release.upper}, {release.velocity}"
+                )
             if not self.domain.contains(release):
                 raise ValueError(
                     f"release[{k}] {release.lower} to {release.upper} leaves the domain "
@@ -227,7 +234,9 @@ class Scene(_Part):
                 )
             for j, other in enumerate(self.releases[:k]):
                 if release.overlaps(other):
-                    raise ValueError(f"release[{k}] overlaps release[{j}]")
+                    raise ValueError(
+                        f"release[{k}] {_span(release)} overlaps release[{j}] {_span(other)}"
+                    )
         boxes: list[Box] = []
         for k, baffle in enumerate(self.baffles):
             if len(baffle.size) != dim:
@@ -240,10 +249,14 @@ class Scene(_Part):
                 )
             for j, release in enumerate(self.releases):
                 if box.overlaps(release):
-                    raise ValueError(f"baffle[{k}] overlaps release[{j}]")
+                    raise ValueError(
+                        f"baffle[{k}] {_span(box)} overlaps release[{j}] {_span(release)}"
+                    )
             for j, other_box in enumerate(boxes):
                 if box.overlaps(other_box):
-                    raise ValueError(f"baffle[{k}] overlaps baffle[{j}]")
+                    raise ValueError(
+                        f"baffle[{k}] {_span(box)} overlaps baffle[{j}] {_span(other_box)}"
+                    )
             boxes.append(box)
         if self.section is not None and not (
             self.domain.lower[0] < self.section < self.domain.upper[0]
@@ -255,7 +268,10 @@ class Scene(_Part):
         if self.placement is not None:
             plan_lower, plan_upper = self._plan(self.domain.lower), self._plan(self.domain.upper)
             if len(self.placement.lower) != dim - 1:
-                raise ValueError(f"placement.lower and upper need {dim - 1} numbers")
+                raise ValueError(
+                    f"placement.lower and upper need {dim - 1} numbers, got "
+                    f"{self.placement.lower}, {self.placement.upper}"
+                )
             if any(
                 p < d - TOLERANCE
                 for p, d in zip(self.placement.lower, plan_lower, strict=True)
@@ -391,7 +407,7 @@ class Scene(_Part):
         return text
 
 
-def write_whole(path: Path, content: bytes) -> None:
+def write_whole(path: Path, content: bytes | memoryview) -> None:
     """Write a file under a temporary name and rename it, so that nobody ever meets half of it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
@@ -403,6 +419,11 @@ def write_whole(path: Path, content: bytes) -> None:
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise
+
+
+def _span(box: Box) -> str:
+    low, high = (tuple(round(v, 6) for v in corner) for corner in (box.lower, box.upper))
+    return f"{low} to {high}"
 
 
 def _plain(value: Any) -> Any:
@@ -444,8 +465,8 @@ def _to_toml(values: dict[str, Any]) -> str:
 
 def _literal(value: Any) -> str:
     if isinstance(value, str):
-        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-        return f'"{escaped}"'
+        # JSON escapes what TOML does, except that TOML also forbids a bare DEL.
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, (list, tuple)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -42,20 +43,29 @@ def load_simulator(name: str | os.PathLike[str], device: str = "cpu", **options:
         options: passed on to the simulator, e.g. `spacing` for "mpm".
 
     Raises:
-        SimulatorError: if there is no such simulator.
+        SimulatorError: if there is no such simulator, or it has no such option.
         FileFormatError: if the checkpoint is truncated or is not ours.
     """
     if str(name) == "mpm":
         from gns_model.mpm import MpmSimulator
 
+        _check_options(MpmSimulator, **options)
         return MpmSimulator(**options)
     from gns_model.learned.checkpoint import load_model, shipped_models
 
     shipped = shipped_models()
     path = shipped.get(str(name), Path(name))
-    if not path.exists():
+    if not str(name) or not path.exists():
         raise SimulatorError(
             f"no simulator named {str(name)!r}: give mpm, {', '.join(sorted(shipped))}, or the "
             "path of a checkpoint folder"
         )
+    _check_options(load_model, path, device=device, **options)
     return load_model(path, device=device, **options)
+
+
+def _check_options(function: Callable[..., Any], *arguments: Any, **options: Any) -> None:
+    try:
+        inspect.signature(function).bind(*arguments, **options)
+    except TypeError as error:
+        raise SimulatorError(f"options of the simulator: {error}") from None

@@ -13,9 +13,9 @@ File format `gns-trajectory`, version 1 (HDF5; nothing in it is pickled):
 
 from __future__ import annotations
 
+import io
 import json
 import os
-import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ import h5py
 import numpy as np
 
 from gns_model.errors import FileFormatError
-from gns_model.scene import Scene
+from gns_model.scene import Scene, write_whole
 
 FORMAT = "gns-trajectory"
 VERSION = 1
@@ -66,36 +66,32 @@ class Trajectory:
         return self.point_volume * self.scene.material.density
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the trajectory whole: under a temporary name, then renamed."""
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        os.close(handle)
-        try:
-            with h5py.File(temporary, "w") as file:
-                frames = np.ascontiguousarray(self.positions, dtype=np.float32)
-                file.create_dataset(
-                    "positions", data=frames, chunks=(1, *frames.shape[1:]) if frames.size else None
-                )
-                file["time"] = np.asarray(self.time, dtype=np.float64)
-                file["particle_type"] = np.asarray(self.particle_type, dtype=np.int8)
-                if self.lattice is not None:
-                    file["lattice"] = np.asarray(self.lattice, dtype=np.int32)
-                file.attrs.update(
-                    format=FORMAT,
-                    version=VERSION,
-                    simulator=self.simulator,
-                    status=self.status,
-                    point_volume=self.point_volume,
-                    scene=json.dumps(self.scene.to_dict()),
-                    settings=json.dumps(self.settings),
-                )
-                file.attrs["frames"] = len(self.time)
-            os.chmod(temporary, 0o644)
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+        """Write the trajectory whole: under a temporary name, then renamed.
+
+        The file is composed in memory first: HDF5 crashes the process when a disk fills up under
+        an open file, whereas a plain write raises OSError.
+        """
+        buffer = io.BytesIO()
+        with h5py.File(buffer, "w") as file:
+            frames = np.ascontiguousarray(self.positions, dtype=np.float32)
+            file.create_dataset(
+                "positions", data=frames, chunks=(1, *frames.shape[1:]) if frames.size else None
+            )
+            file["time"] = np.asarray(self.time, dtype=np.float64)
+            file["particle_type"] = np.asarray(self.particle_type, dtype=np.int8)
+            if self.lattice is not None:
+                file["lattice"] = np.asarray(self.lattice, dtype=np.int32)
+            file.attrs.update(
+                format=FORMAT,
+                version=VERSION,
+                simulator=self.simulator,
+                status=self.status,
+                point_volume=self.point_volume,
+                scene=json.dumps(self.scene.to_dict()),
+                settings=json.dumps(self.settings),
+            )
+            file.attrs["frames"] = len(self.time)
+        write_whole(Path(path), buffer.getbuffer())
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Trajectory:
@@ -105,18 +101,20 @@ class Trajectory:
             FileFormatError: if it is missing, truncated, foreign or of a newer version.
         """
         with open_trajectory(path) as file:
-            attributes = file.attrs
-            return cls(
-                positions=file["positions"][()],
-                time=file["time"][()],
-                particle_type=file["particle_type"][()],
-                scene=Scene.from_dict(json.loads(attributes["scene"]), source=str(path)),
-                point_volume=float(attributes["point_volume"]),
-                simulator=str(attributes["simulator"]),
-                status=str(attributes["status"]),
-                settings=json.loads(attributes["settings"]),
-                lattice=file["lattice"][()] if "lattice" in file else None,
-            )
+            try:
+                return cls(
+                    positions=file["positions"][()],
+                    time=file["time"][()],
+                    particle_type=file["particle_type"][()],
+                    scene=Scene.from_dict(_json(file, "scene"), source="scene"),
+                    point_volume=_read(file, "point_volume", float),
+                    simulator=_read(file, "simulator", str),
+                    status=_read(file, "status", str),
+                    settings=_json(file, "settings"),
+                    lattice=file["lattice"][()] if "lattice" in file else None,
+                )
+            except _DAMAGE as error:
+                raise FileFormatError(f"{path}: damaged or foreign ({_line(error)})") from None
 
 
 def open_trajectory(path: str | os.PathLike[str]) -> h5py.File:
@@ -130,22 +128,56 @@ def open_trajectory(path: str | os.PathLike[str]) -> h5py.File:
         raise FileFormatError(f"{path}: no such file")
     try:
         file = h5py.File(path, "r")
-    except OSError:
+    except _DAMAGE:
         raise FileFormatError(f"{path}: truncated, or not an HDF5 file") from None
     try:
-        if file.attrs.get("format") != FORMAT:
+        if _read(file, "format", str, default="") != FORMAT:
             raise FileFormatError(f"{path}: an HDF5 file, but not a {FORMAT} file")
-        if int(file.attrs["version"]) > VERSION:
+        version = _read(file, "version", int)
+        if version > VERSION:
             raise FileFormatError(
-                f"{path}: version {file.attrs['version']}, this program reads up to {VERSION}"
+                f"{path}: version {version}, this program reads up to {VERSION}"
             )
-        frames = file.attrs.get("frames")
-        shape = file["positions"].shape
-        if frames is None or shape[0] != frames or file["time"].shape != (frames,):
-            raise FileFormatError(f"{path}: truncated, holds {shape[0]} of {frames} frames")
-    except (KeyError, FileFormatError) as error:
+        frames = _read(file, "frames", int)
+        shapes = {name: file[name].shape for name in ("positions", "time", "particle_type")}
+        points = shapes["positions"][1:2]
+        if shapes["positions"][:1] != (frames,) or shapes["time"] != (frames,):
+            raise FileFormatError(
+                f"{path}: truncated, holds {shapes['positions'][0]} of {frames} frames"
+            )
+        if len(shapes["positions"]) != 3 or shapes["particle_type"] != points:
+            raise FileFormatError(f"{path}: positions and particle_type do not fit: {shapes}")
+    except FileFormatError:
         file.close()
-        if isinstance(error, FileFormatError):
-            raise
-        raise FileFormatError(f"{path}: {error.args[0]}, so it is truncated or foreign") from None
+        raise
+    except _DAMAGE as error:
+        file.close()
+        raise FileFormatError(f"{path}: truncated or foreign ({_line(error)})") from None
     return file
+
+
+#: What HDF5, JSON and NumPy raise on damaged content.
+_DAMAGE = (
+    OSError, KeyError, IndexError, ValueError, TypeError, RuntimeError, MemoryError, AttributeError,
+)
+
+
+def _read(file: h5py.File, name: str, kind: type, **default: Any) -> Any:
+    """The attribute `name` as `kind`; a fault names the attribute."""
+    if "default" in default and name not in file.attrs:
+        return default["default"]
+    try:
+        return kind(file.attrs[name])
+    except _DAMAGE:
+        raise ValueError(f"no readable attribute {name!r}") from None
+
+
+def _json(file: h5py.File, name: str) -> Any:
+    try:
+        return json.loads(_read(file, name, str))
+    except ValueError:
+        raise ValueError(f"attribute {name!r} is not readable JSON") from None
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

@@ -7,7 +7,8 @@ import math
 import numpy as np
 from numba import njit
 
-#: Distance that a point is put outside a face [m]: more than a float32 rounds off at metres.
+#: Boxes are taken this much larger, and the domain smaller [m]: more than float32 rounds off when
+#: positions are stored, so that no stored point lies inside a baffle or outside the domain.
 SKIN = 1e-6
 
 
@@ -61,19 +62,19 @@ def box_contact(px, py, pz, vx, vy, vz, box, mu, flat, lower, upper):
     """Put a point that entered a box back on its nearest face and apply friction there."""
     face, _ = nearest_face(px, py, pz, box, flat, lower, upper)
     if face == 1:
-        px = box[0, 0] - SKIN
+        px = box[0, 0]
         vx, vy, vz = slide(vx, vy, vz, -1.0, mu)
     elif face == 2:
-        px = box[1, 0] + SKIN
+        px = box[1, 0]
         vx, vy, vz = slide(vx, vy, vz, 1.0, mu)
     elif face == 3:
-        py = box[1, 1] + SKIN
+        py = box[1, 1]
         vy, vx, vz = slide(vy, vx, vz, 1.0, mu)
     elif face == 4:
-        pz = box[0, 2] - SKIN
+        pz = box[0, 2]
         vz, vx, vy = slide(vz, vx, vy, -1.0, mu)
     elif face == 5:
-        pz = box[1, 2] + SKIN
+        pz = box[1, 2]
         vz, vx, vy = slide(vz, vx, vy, 1.0, mu)
     return px, py, pz, vx, vy, vz
 

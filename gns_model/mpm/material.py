@@ -1,7 +1,7 @@
 """Mohr-Coulomb with cohesion and tension cutoff, in rate form: what a point's stress becomes.
 
-The stress has an isotropic part from the accumulated logarithmic volume strain (so that grains
-that separated and meet again find their old density) and a deviatoric part from the Jaumann rate.
+The stress has an isotropic part from the accumulated logarithmic volume strain, which stops at
+the tension cutoff, and a deviatoric part from the Jaumann rate.
 The trial stress is returned to the yield surface in principal space at constant mean stress
 (non-associated flow without dilation; de Souza Neto, Peric & Owen 2008, ch. 8). Tension positive.
 """

@@ -135,6 +135,8 @@ class MpmSimulator:
         lattice, lower, upper = _lattice(scene, 2 * spacing)
         boxes = np.zeros((len(scene.baffles), 2, 3))
         boxes[:, :, :dim] = scene.baffle_boxes()
+        boxes[:, 0] -= SKIN
+        boxes[:, 1] += SKIN
         solid = solid_nodes(lattice, boxes, 0.5 * lattice.dx, lower, upper)
         grid = np.zeros((len(solid), NODE_COLUMNS))
         gravity = np.zeros(3)

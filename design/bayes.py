@@ -1,0 +1,99 @@
+"""Bayesian search: an Optuna sampler proposes batches of layouts, each batch is one evaluation.
+
+The sampler sees layouts through `parameters` (one point a layout) and learns from the buildable
+layout that was run, not from the wish that was projected onto it.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+import optuna
+from optuna.distributions import BaseDistribution
+from optuna.trial import FrozenTrial
+
+from design.baselines import engineering_layouts
+from design.campaign import Campaign
+from design.parameters import to_centres, to_parameters
+from design.trials import TrialLog
+
+#: Random buildable layouts, beside the baselines, before the model takes over.
+LEAST_STARTUP = 10
+
+
+def search(campaign: Campaign, until: int | None = None) -> None:
+    """Baselines first, then batches from the sampler, until the budget (or `until`) is spent."""
+    enqueue_baselines(campaign)
+    goal = campaign.budget if until is None else min(until, campaign.budget)
+    while (left := goal - campaign.log.spent()) > 0:
+        campaign.try_proposals(min(campaign.batch, left), sampler(campaign))
+
+
+def enqueue_baselines(campaign: Campaign) -> None:
+    """Have the engineering layouts tried first."""
+    for origin, centres in engineering_layouts(campaign.space):
+        campaign.log.enqueue(origin, centres)
+
+
+def sampler(campaign: Campaign) -> optuna.samplers.BaseSampler:
+    """The sampler of the next batch. Made anew for each, so that resuming changes nothing."""
+    rng = campaign.rng()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        model = optuna.samplers.TPESampler(
+            multivariate=True,
+            constant_liar=True,
+            n_startup_trials=startup(campaign),
+            seed=int(rng.integers(2**31)),
+        )
+    return BuildableSampler(model, campaign.log, rng)
+
+
+def startup(campaign: Campaign) -> int:
+    """Trials before the model takes over."""
+    return max(LEAST_STARTUP, 2 * campaign.space.dim)
+
+
+class BuildableSampler(optuna.samplers.BaseSampler):
+    """Passes on what `model` proposes as the nearest buildable layout, so that the parameters in
+    the study are those of the layout that was run. Before the model has seen enough it proposes
+    random buildable layouts."""
+
+    def __init__(
+        self, model: optuna.samplers.BaseSampler, log: TrialLog, rng: np.random.Generator
+    ) -> None:
+        self._model, self._log, self._rng = model, log, rng
+
+    def infer_relative_search_space(
+        self, study: optuna.Study, trial: FrozenTrial
+    ) -> dict[str, BaseDistribution]:
+        """All parameters, also in a study without trials."""
+        # TPE remembers the space it inferred, so it has to be asked although its answer is not
+        # needed: the space here is the same for every trial.
+        self._model.infer_relative_search_space(study, trial)
+        return dict(self._log.distributions)
+
+    def sample_relative(
+        self, study: optuna.Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
+    ) -> dict[str, Any]:
+        """Parameters of the buildable layout nearest to the model's proposal."""
+        space = self._log.space
+        wish = self._model.sample_relative(study, trial, search_space)
+        centres = to_centres(space, wish) if wish else space.random(self._rng)
+        return dict(to_parameters(space, self._log.buildable(centres)))
+
+    def sample_independent(
+        self,
+        study: optuna.Study,
+        trial: FrozenTrial,
+        param_name: str,
+        param_distribution: BaseDistribution,
+    ) -> Any:
+        """Never needed: every parameter is sampled with the others."""
+        raise AssertionError(f"{param_name} was not sampled with the others")
+
+    def after_trial(self, *arguments: Any, **options: Any) -> None:
+        """Let the model see what became of its proposal."""
+        self._model.after_trial(*arguments, **options)

@@ -1,0 +1,90 @@
+"""What a search works with: layouts to propose, an evaluator to run them, a log, and a budget."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import optuna
+
+from design.trials import Outcome, Proposal, Trial, TrialLog
+from gns_env.layout import LayoutSpace
+
+
+class Evaluator(Protocol):
+    """Runs layouts, several at once; yields (index, outcome) as they end."""
+
+    differentiable: bool
+
+    def evaluate(self, layouts: Sequence[np.ndarray]) -> Iterator[tuple[int, Outcome]]:
+        """One rollout a layout; each layout [m], shape (n, D-1)."""
+        ...
+
+    def differentiate(self, layouts: Sequence[np.ndarray]) -> Iterator[tuple[int, Outcome]]:
+        """One rollout and one backward pass a layout; outcomes hold a gradient."""
+        ...
+
+
+class Search(Protocol):
+    """A search: spends what is left of the campaign's budget and leaves trials in its log."""
+
+    def __call__(self, campaign: Campaign) -> None: ...
+
+
+@dataclass
+class Campaign:
+    """One search under way.
+
+    Attributes:
+        log: every trial so far, also those of an earlier run that is resumed.
+        evaluator: runs layouts.
+        budget: passes through a rollout to spend in all; a backward pass counts like a forward one.
+        seed: of everything random.
+        batch: layouts proposed before their results are looked at. Fixed, and not the number of
+            workers, so that a seed gives the same search on every machine.
+        on_trial: called with every new trial.
+        salt: tells apart the machines that share one study.
+    """
+
+    log: TrialLog
+    evaluator: Evaluator
+    budget: int
+    seed: int = 0
+    batch: int = 8
+    on_trial: Callable[[Trial], None] = lambda trial: None
+    salt: int = 0
+
+    @property
+    def space(self) -> LayoutSpace:
+        """The buildable layouts."""
+        return self.log.space
+
+    def left(self) -> int:
+        """Passes through a rollout still to spend."""
+        return max(self.budget - self.log.spent(), 0)
+
+    def rng(self, *salt: int) -> np.random.Generator:
+        """Randomness that depends on the seed and on how far the search is, so that a resumed
+        search goes on as it would have."""
+        return np.random.default_rng([self.seed, self.salt, len(self.log.trials()), *salt])
+
+    def try_proposals(self, count: int, sampler: optuna.samplers.BaseSampler) -> list[Trial]:
+        """Ask for `count` layouts, run them, tell their outcomes as they come."""
+        proposals: list[Proposal] = []
+        trials = []
+        try:
+            proposals = self.log.ask(count, sampler)
+            for k, outcome in self.evaluator.evaluate([p.centres for p in proposals]):
+                trials.append(self.log.tell(proposals[k], outcome))
+                self.on_trial(trials[-1])
+        finally:
+            self.log.abandon()
+        return trials
+
+    def record(self, origin: str, centres: np.ndarray, outcome: Outcome) -> Trial:
+        """Put a layout that the log did not ask for on record."""
+        trial = self.log.add(origin, centres, outcome)
+        self.on_trial(trial)
+        return trial

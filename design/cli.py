@@ -1,0 +1,228 @@
+"""gns-design: find a baffle layout, and measure one.
+
+Heavy imports wait until a command needs them, so that --help answers at once.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Optional
+
+import typer
+
+from gns_model import console
+
+if TYPE_CHECKING:
+    from design.evaluators import SimulatorSpec
+
+app = typer.Typer(
+    help="Find where baffles stop a granular flow, checked by the reference solver.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+SceneFile = Annotated[Path, typer.Argument(help="Scene file (TOML).", show_default=False)]
+Simulator = Annotated[
+    str, typer.Option(help="mpm, a shipped model such as baffle-lite, or a checkpoint folder.")
+]
+Spacing = Annotated[
+    Optional[float],  # noqa: UP045  (typer reads it at run time, also on Python 3.11)
+    typer.Option(help="Spacing of points for mpm [m]; default: the solver's fine one."),
+]
+Device = Annotated[str, typer.Option(help="torch device of a learned simulator: cpu or cuda.")]
+
+
+@app.command()
+def optimize(
+    scene: SceneFile,
+    method: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            help="bayes, gradient or hybrid; default: hybrid where the simulator has a gradient."
+        ),
+    ] = None,
+    baffles: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option(help="How many baffles; default: as many as the scene has, or 3."),
+    ] = None,
+    budget: Annotated[
+        int,
+        typer.Option(help="Rollouts of the search; a gradient's backward pass counts as one too."),
+    ] = 64,
+    verify: Annotated[
+        int, typer.Option(help="How many of the best the reference solver judges; 0: none.")
+    ] = 4,
+    seed: Annotated[int, typer.Option(help="Seed of everything random.")] = 0,
+    out: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="Run folder; default: runs/<name of the scene>.", show_default=False),
+    ] = None,
+    storage: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            help="Optuna storage address, to share a search between machines; default: SQLite in "
+            "the run folder.",
+            show_default=False,
+        ),
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with what the run folder and storage hold.")
+    ] = False,
+    simulator: Simulator = "baffle-lite",
+    spacing: Spacing = None,
+    device: Device = "cpu",
+    verify_with: Annotated[str, typer.Option(help="Who judges the best layouts.")] = "mpm",
+    verify_spacing: Spacing = None,
+    runout_weight: Annotated[float, typer.Option(help="Weight of the centroid's travel.")] = 1.0,
+    depth_weight: Annotated[float, typer.Option(help="Weight of the upstream depth.")] = 0.25,
+    mass_weight: Annotated[
+        float, typer.Option(help="Weight of the mass past the control section.")
+    ] = 0.0,
+    batch: Annotated[int, typer.Option(help="Layouts proposed at a time.")] = 8,
+    workers: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option(help="Processes of one thread; default: one a core.", show_default=False),
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no table.")] = False,
+) -> None:
+    """Search for a layout of baffles, verify the best on the reference solver, write a report."""
+    with console.clean_errors():
+        from gns_model.scene import Scene
+
+        given = Scene.from_toml(scene)
+        from design.run import Settings, optimise
+        from gns_env.objective import Objective
+
+        settings = Settings(
+            method=method,
+            baffles=baffles,
+            budget=budget,
+            verify=verify,
+            seed=seed,
+            simulator=_spec(simulator, spacing, device),
+            verifier=_spec(verify_with, verify_spacing, device),
+            objective=Objective(
+                runout_weight=runout_weight, depth_weight=depth_weight, mass_weight=mass_weight
+            ),
+            storage=storage,
+            resume=resume,
+            workers=workers,
+            batch=batch,
+        )
+        folder = out if out is not None else Path("runs") / given.name
+        summary = optimise(given, folder, settings, quiet=quiet)
+        if not quiet:
+            _show(summary, folder)
+
+
+@app.command()
+def evaluate(
+    layout: SceneFile,
+    simulator: Simulator = "mpm",
+    spacing: Spacing = None,
+    device: Device = "cpu",
+    json_output: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress.")] = False,
+) -> None:
+    """Measure a scene file with its baffles, beside the same scene without any."""
+    with console.clean_errors():
+        from gns_model.scene import Scene
+
+        given = Scene.from_toml(layout)
+        from design.measure import measure
+
+        result = measure(given, _spec(simulator, spacing, device), quiet=quiet)
+        if json_output:
+            import json
+
+            print(json.dumps(result, indent=2, allow_nan=False))
+        else:
+            _show_measures(result)
+
+
+def _spec(name: str, spacing: float | None, device: str) -> SimulatorSpec:
+    from design.evaluators import SimulatorSpec
+    from gns_model.errors import SimulatorError
+
+    if name == "mpm":
+        return SimulatorSpec(name, options=() if spacing is None else (("spacing", spacing),))
+    if spacing is not None:
+        raise SimulatorError(f"a spacing can be chosen for mpm only; {name} has its own")
+    import torch
+
+    try:
+        kind = torch.device(device).type
+    except RuntimeError:
+        raise SimulatorError(f"no device {device!r}: give cpu or cuda") from None
+    if kind not in ("cpu", "cuda") or (kind == "cuda" and not torch.cuda.is_available()):
+        raise SimulatorError(f"device {device!r} is not there: give cpu" + " or cuda" * (kind != "cuda"))
+    return SimulatorSpec(name, device=device)
+
+
+def _show(summary: dict[str, Any], folder: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from gns_model.measures import UNITS
+
+    out = Console(soft_wrap=True)
+    verified = bool((summary["best"] or {}).get("verified"))
+    who = summary["settings"]["verify_with" if verified else "simulator"]["name"]
+    table = Table(title=f"Measures by {who}")
+    for column in ("", "best found", "scene's own", "no baffles"):
+        table.add_column(column, justify="left" if not column else "right")
+    role = "verified" if verified else "surrogate"
+    columns = [(summary[k] or {}).get(role) or {} for k in ("best", "paper_layout", "no_baffles")]
+    for name, unit in UNITS.items():
+        values = [f"{c[name]:.4g}" if name in c else "-" for c in columns]
+        table.add_row(f"{name} [{unit}]".replace("[", r"\["), *values)
+    key = "verified_cost" if verified else "cost"
+    costs = [(summary[k] or {}).get(key) for k in ("best", "paper_layout", "no_baffles")]
+    table.add_row("cost", *(f"{c:.4f}" if c is not None else "-" for c in costs))
+    out.print(table)
+    if summary["best"]:
+        places = "  ".join(
+            "(" + ", ".join(f"{v:.3f}" for v in c) + ")" for c in summary["best"]["layout"]
+        )
+        out.print(f"Layout, centres [m]: {places}", markup=False, highlight=False)
+    out.print(summary["verdict_text"], markup=False, highlight=False)
+    for note in summary["notes"]:
+        out.print(f"Note: {note}", markup=False, highlight=False)
+    out.print(
+        f"{summary['rollouts']} rollouts, {summary['backwards']} gradients, "
+        f"{summary['reference_rollouts']} reference rollouts, "
+        f"{summary['seconds']['total']:.0f} s. Open {folder / 'report.html'}",
+        markup=False,
+        highlight=False,
+    )
+
+
+def _show_measures(result: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from gns_model.measures import UNITS
+
+    table = Table(title=f"{result['scene']}, {result['baffles']} baffles, by {result['simulator']}")
+    for column in ("", "with baffles", "no baffles", "change"):
+        table.add_column(column, justify="left" if not column else "right")
+    for name, unit in UNITS.items():
+        change = result["relative"].get(name)
+        table.add_row(
+            rf"{name} \[{unit}]",
+            f"{result['measures'][name]:.4g}",
+            f"{result['no_baffles'][name]:.4g}",
+            "-" if change is None else f"{100 * (change - 1):+.1f}%",
+        )
+    table.add_row("cost", f"{result['cost']:.4f}", f"{result['cost_no_baffles']:.4f}", "")
+    Console().print(table)
+
+
+def main() -> None:
+    """Entry point of the command."""
+    console.main(app, "gns-design")
+
+
+if __name__ == "__main__":
+    main()

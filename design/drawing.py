@@ -1,0 +1,165 @@
+"""A layout as an SVG drawing for the page: plan in 3D, elevation in 2D, coloured by the page's CSS."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+
+import numpy as np
+
+from gns_model.scene import Scene
+
+#: Pixels of the drawing's longer side, and room for the ticks around it.
+LONG, LEFT, BOTTOM, TOP, RIGHT = 520.0, 46.0, 40.0, 22.0, 14.0
+
+
+class Paper:
+    """Metres to pixels for one scene, the second axis (z in plan, y in elevation) upwards."""
+
+    def __init__(self, scene: Scene, long: float) -> None:
+        self.scene = scene
+        lower, upper = np.array(scene.domain.lower), np.array(scene.domain.upper)
+        second = 2 if scene.dim == 3 else 1
+        self.axes = (0, second)
+        self.low, self.high = lower[[0, second]], upper[[0, second]]
+        self.scale = long / float((self.high - self.low).max())
+        self.width, self.height = (self.high - self.low) * self.scale
+
+    def rectangle(self, low: Sequence[float], high: Sequence[float], attributes: str) -> str:
+        """An SVG rectangle between two corners given in metres, already in the two axes shown."""
+        x, y = (low[0] - self.low[0]) * self.scale, (self.high[1] - high[1]) * self.scale
+        width, height = (high[0] - low[0]) * self.scale, (high[1] - low[1]) * self.scale
+        return (
+            f'<rect x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{height:.1f}" '
+            f"{attributes}/>"
+        )
+
+    def at(self, point: Sequence[float]) -> tuple[float, float]:
+        """Pixels of a point in metres."""
+        return (point[0] - self.low[0]) * self.scale, (self.high[1] - point[1]) * self.scale
+
+    def boxes(self, scene: Scene) -> np.ndarray:
+        """Baffles in the two axes shown [m], shape (B, 2, 2)."""
+        return scene.baffle_boxes()[:, :, list(self.axes)]
+
+
+def layout_drawing(scene: Scene, best: Scene, own: Scene | None) -> str:
+    """The layout `best`, numbered, in its surroundings; `own` in outline for comparison."""
+    paper = Paper(scene, LONG)
+    parts = [
+        '<defs><pattern id="hatch" width="7" height="7" patternUnits="userSpaceOnUse" '
+        'patternTransform="rotate(45)"><path d="M0 0V7" class="hatch"/></pattern></defs>',
+        paper.rectangle(paper.low, paper.high, 'class="ground"'),
+    ]
+    second = paper.axes[1]
+    for release in scene.releases:
+        low, high = [[c[0], c[second]] for c in (release.lower, release.upper)]
+        parts.append(paper.rectangle(low, high, 'class="release"'))
+    parts += _arrow(paper)
+    parts += _placement(paper)
+    parts += _section(paper)
+    for low, high in paper.boxes(own) if own is not None else ():
+        parts.append(paper.rectangle(low, high, 'class="own"'))
+    for number, (low, high) in enumerate(paper.boxes(best), start=1):
+        x, y = paper.at((low + high) / 2)
+        parts.append(paper.rectangle(low, high, 'class="best" rx="1.5"'))
+        parts.append(f'<text x="{x:.1f}" y="{y:.1f}" dy="0.36em" class="number">{number}</text>')
+    parts += _ticks(paper)
+    title = f"{'Plan' if scene.dim == 3 else 'Elevation'} of the layout in {scene.name}"
+    return (
+        f'<svg class="plan" viewBox="{-LEFT} {-TOP} {paper.width + LEFT + RIGHT:.0f} '
+        f'{paper.height + TOP + BOTTOM:.0f}" role="img" aria-label="{escape(title)}">'
+        f"{''.join(parts)}</svg>"
+    )
+
+
+def thumbnail(scene: Scene, layout: Scene, kind: str) -> str:
+    """The layout alone, a few millimetres tall, for a table row; `kind` is the CSS class."""
+    paper = Paper(scene, 92.0)
+    parts = [paper.rectangle(paper.low, paper.high, 'class="ground"')]
+    second = paper.axes[1]
+    for release in scene.releases:
+        low, high = [[c[0], c[second]] for c in (release.lower, release.upper)]
+        parts.append(paper.rectangle(low, high, 'class="release"'))
+    parts += [paper.rectangle(lo, hi, f'class="{kind}"') for lo, hi in paper.boxes(layout)]
+    return (
+        f'<svg class="thumb" viewBox="-1 -1 {paper.width + 2:.0f} {paper.height + 2:.0f}" '
+        f'aria-hidden="true">{"".join(parts)}</svg>'
+    )
+
+
+def _arrow(paper: Paper) -> list[str]:
+    """Which way the mass moves, from the middle of the first release."""
+    release = paper.scene.releases[0]
+    second = paper.axes[1]
+    x, y = paper.at([(release.lower[a] + release.upper[a]) / 2 for a in (0, second)])
+    along, across = release.velocity[0], -release.velocity[second]
+    speed = float(np.hypot(along, across))
+    if speed == 0:
+        return []
+    dx, dy = 26 * along / speed, 26 * across / speed
+    turn = np.degrees(np.arctan2(dy, dx))
+    return [
+        f'<g transform="translate({x:.1f} {y:.1f}) rotate({turn:.1f})" class="arrow">'
+        '<path d="M-26 0H22M13 -7L23 0L13 7"/></g>',
+        f'<text x="{x:.1f}" y="{y + 24:.1f}" class="small on-sand">{speed:g} m/s</text>',
+    ]
+
+
+def _placement(paper: Paper) -> list[str]:
+    placement = paper.scene.placement
+    if placement is None:
+        return []
+    if paper.scene.dim == 2:
+        x0, x1 = paper.at((placement.lower[0], 0))[0], paper.at((placement.upper[0], 0))[0]
+        y = paper.height + 5
+        return [f'<path d="M{x0:.1f} {y:.1f}H{x1:.1f}" class="placement"/>']
+    parts = [
+        paper.rectangle(rectangle[:2], rectangle[2:], 'class="keep-out" fill="url(#hatch)"')
+        for rectangle in placement.keep_out
+    ]
+    return [paper.rectangle(placement.lower, placement.upper, 'class="placement"'), *parts]
+
+
+def _section(paper: Paper) -> list[str]:
+    x, _ = paper.at((paper.scene.control_section, 0))
+    return [
+        f'<path d="M{x:.1f} 0V{paper.height:.1f}" class="section"/>',
+        f'<text x="{x:.1f}" y="-8" class="small middle">control section x = '
+        f"{paper.scene.control_section:g} m</text>",
+    ]
+
+
+def _ticks(paper: Paper) -> list[str]:
+    """Round coordinates along both axes, at most seven each."""
+    parts = []
+    for axis, name in enumerate(("x", "z" if paper.scene.dim == 3 else "y")):
+        low, high = float(paper.low[axis]), float(paper.high[axis])
+        choices = [b * 10**e for e in range(-2, 4) for b in (1, 2, 2.5, 5)]
+        step = next((s for s in choices if (high - low) / s <= 7), high - low)
+        for k in range(int(np.ceil(low / step - 1e-9)), int(np.floor(high / step + 1e-9)) + 1):
+            value = k * step
+            x, y = paper.at((value, value))
+            if axis == 0:
+                parts.append(
+                    f'<path d="M{x:.1f} {paper.height:.1f}v5" class="tick"/>'
+                    f'<text x="{x:.1f}" y="{paper.height + 18:.1f}" class="small middle">'
+                    f"{value:g}</text>"
+                )
+            else:
+                parts.append(
+                    f'<path d="M0 {y:.1f}h-5" class="tick"/>'
+                    f'<text x="-9" y="{y:.1f}" dy="0.35em" class="small end">{value:g}</text>'
+                )
+        if axis == 0:
+            parts.append(
+                f'<text x="{paper.width / 2:.1f}" y="{paper.height + 34:.1f}" '
+                f'class="small middle">{name} [m], downstream</text>'
+            )
+        else:
+            middle = paper.height / 2
+            parts.append(
+                f'<text transform="translate(-36 {middle:.1f}) rotate(-90)" '
+                f'class="small middle">{name} [m]</text>'
+            )
+    return parts

@@ -1,0 +1,208 @@
+"""Gradient search: autograd through the whole rollout, projected Adam steps, several starts.
+
+A gradient costs one forward rollout and one backward pass (with a checkpoint a step, about three
+forwards of time), so steps are few and chosen: every step is projected onto the buildable layouts
+by cvxpy, and a chain that stops improving goes back to its best layout with half the step. Smooth
+measures steer; the hard measures of the same rollout decide what is best.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from design.baselines import engineering_layouts, random_layouts
+from design.campaign import Campaign
+from design.distinct import apart
+from design.trials import Outcome
+from gns_env.layout import LayoutSpace
+from gns_env.task import BaffleTask
+from gns_model import measures as hard
+from gns_model.errors import SimulatorError
+from gns_model.particles import MOVING
+from gns_model.scene import Scene
+from gns_model.trajectory import DIVERGED, OK, Trajectory
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+#: First step of a chain [m]: a fifth of the paper's baffle; Adam moves every coordinate by about it.
+STEP = 0.03
+#: Steps shorter than this end a chain [m]: less than anybody builds to.
+LEAST_STEP = 0.003
+#: Decay of Adam's running means; short memories, since a chain has few steps.
+BETA_MEAN, BETA_SQUARE = 0.7, 0.9
+#: Chains of a pure gradient search.
+STARTS = 4
+
+
+def search(campaign: Campaign) -> None:
+    """Run the starts, then chains of steps from the best of them until the budget is spent.
+
+    Starts are the engineering layouts and as many random ones as chains. When all chains have ended
+    early, new ones start from random layouts.
+
+    Raises:
+        SimulatorError: if the simulator has no gradient.
+    """
+    require_gradient(campaign)
+    log, space = campaign.log, campaign.space
+    if not any(t.origin != "scene" for t in log.trials()):
+        starts = [*engineering_layouts(space), *random_layouts(space, STARTS, campaign.rng(1))]
+        # At least half of the budget is for steps.
+        starts = starts[: max(campaign.left() // 2, 1)]
+        for k, outcome in campaign.evaluator.evaluate([c for _, c in starts]):
+            campaign.record(*starts[k], outcome)
+    first = True
+    while campaign.left() >= 2:
+        if first:
+            ranked = sorted((t for t in log.trials() if t.ok), key=lambda t: t.cost)
+            origins = apart([t.centres for t in ranked], STEP, STARTS)
+        else:
+            origins = [c for _, c in random_layouts(space, STARTS, campaign.rng(2))]
+        first = False
+        descend(campaign, origins, campaign.left())
+
+
+def require_gradient(campaign: Campaign) -> None:
+    """Refuse a simulator without gradient before anything is spent."""
+    if not campaign.evaluator.differentiable:
+        raise SimulatorError(
+            "this simulator has no gradient, so --method gradient or hybrid cannot use it: choose "
+            "a learned simulator such as baffle-lite, or --method bayes"
+        )
+
+
+def descend(campaign: Campaign, starts: Sequence[np.ndarray], budget: int) -> None:
+    """Step all chains together from `starts` [m], shape (n, D-1), within `budget` passes."""
+    chains = [Chain(campaign.space, start) for start in starts]
+    while chains and budget >= 2:
+        chains = chains[: budget // 2]
+        budget -= 2 * len(chains)
+        layouts = [chain.centres for chain in chains]
+        for k, outcome in campaign.evaluator.differentiate(layouts):
+            campaign.record("gradient", layouts[k], outcome)
+            chains[k].learn(outcome)
+        chains = [chain for chain in chains if chain.step >= LEAST_STEP]
+
+
+class Chain:
+    """One start of projected Adam. `centres` is the layout to differentiate next.
+
+    Adam's direction is scaled so that the largest move of a coordinate is at most `step`.
+    """
+
+    def __init__(self, space: LayoutSpace, centres: np.ndarray, step: float = STEP) -> None:
+        self._space = space
+        self.centres = np.array(centres, dtype=float)
+        self.step = step
+        self.best_cost = np.inf
+        self._best = self.centres
+        self._best_gradient: np.ndarray | None = None
+        self._misses = 0
+        self._forget()
+
+    def learn(self, outcome: Outcome) -> None:
+        """Take in the outcome at `centres` and move on."""
+        gradient = outcome.gradient
+        usable = outcome.status == OK and gradient is not None and np.isfinite(gradient).all()
+        if usable and outcome.cost < self.best_cost:
+            self.best_cost, self._best, self._best_gradient = outcome.cost, self.centres, gradient
+            self._misses = 0
+        else:
+            self._misses += 1
+            if not usable or self._misses >= 2:
+                # Back to the best layout with a shorter step and no memory of the way.
+                self.step /= 2
+                self._misses = 0
+                self._forget()
+                if self._best_gradient is None:  # the start itself failed
+                    self.step = 0.0
+                    return
+                self.centres, gradient = self._best, self._best_gradient
+        assert gradient is not None
+        moved = self._space.project(self.centres - self._direction(gradient))
+        if np.abs(moved - self.centres).max() < LEAST_STEP / 10:
+            self.step = 0.0  # held by the constraints: a local optimum
+        self.centres = np.asarray(moved, dtype=float)
+
+    def _direction(self, gradient: np.ndarray) -> np.ndarray:
+        self._count += 1
+        self._mean = BETA_MEAN * self._mean + (1 - BETA_MEAN) * gradient
+        # One scale for all coordinates: a baffle that does not matter should not move.
+        square = float(np.square(gradient).max())
+        self._square = BETA_SQUARE * self._square + (1 - BETA_SQUARE) * square
+        mean = self._mean / (1 - BETA_MEAN**self._count)
+        scale = np.sqrt(self._square / (1 - BETA_SQUARE**self._count))
+        return np.clip(self.step * mean / max(scale, 1e-12), -self.step, self.step)
+
+    def _forget(self) -> None:
+        self._mean, self._square, self._count = np.zeros_like(self.centres), 0.0, 0
+
+
+def differentiate(task: BaffleTask, layouts: Sequence[np.ndarray]) -> list[Outcome]:
+    """One rollout and one backward pass of each layout [m], shape (n, D-1), as one batch.
+
+    The gradient is that of the smooth objective; cost and measures are hard, of the same rollout.
+    """
+    import torch
+
+    from gns_model.smooth_measures import smooth_measures
+
+    started = time.perf_counter()
+    simulator = task.simulator
+    scenes = [task.scene_with(layout) for layout in layouts]
+    centres = [torch.tensor(np.asarray(c, dtype=np.float64), requires_grad=True) for c in layouts]
+    rollouts = simulator.rollout_tensor(scenes, centres)  # type: ignore[attr-defined]
+    reference = task.reference
+    smooth = [
+        task.objective.smooth(
+            smooth_measures(positions, scene, c, tuple(task.space.size)), reference
+        )
+        for positions, scene, c in zip(rollouts, scenes, centres, strict=True)
+    ]
+    torch.stack([s.to(torch.float64) for s in smooth]).sum().backward()
+    seconds = (time.perf_counter() - started) / len(layouts)
+    outcomes = []
+    for positions, scene, c in zip(rollouts, scenes, centres, strict=True):
+        gradient = c.grad.detach().cpu().numpy() if c.grad is not None else None
+        outcomes.append(_outcome(task, positions, scene, gradient, seconds))
+    return outcomes
+
+
+def _outcome(
+    task: BaffleTask,
+    positions: Tensor,
+    scene: Scene,
+    gradient: np.ndarray | None,
+    seconds: float,
+) -> Outcome:
+    config = task.simulator.config  # type: ignore[attr-defined]
+    frames = positions.detach().cpu().numpy()
+    sane = gradient is not None and np.isfinite(gradient).all() and _plausible(frames, scene)
+    if not sane:
+        return Outcome(
+            task.objective.failure_cost, {}, DIVERGED, rollouts=1, backwards=1, seconds=seconds
+        )
+    trajectory = Trajectory(
+        positions=frames,
+        time=np.arange(len(frames)) * config.dt,
+        particle_type=np.full(frames.shape[1], MOVING, np.int8),
+        scene=scene,
+        point_volume=config.spacing**scene.dim,
+        simulator=task.simulator.name,
+    )
+    values = hard.summary(trajectory)
+    cost = task.objective.cost(values, task.reference)
+    return Outcome(
+        cost, values, OK, rollouts=1, backwards=1, seconds=seconds, gradient=gradient
+    )
+
+
+def _plausible(frames: np.ndarray, scene: Scene) -> bool:
+    """Whether all positions (T, N, D) are finite and within the domain, 1 cm of slack [m]."""
+    lower, upper = np.asarray(scene.domain.lower) - 0.01, np.asarray(scene.domain.upper) + 0.01
+    return bool(np.isfinite(frames).all() and (frames >= lower).all() and (frames <= upper).all())

@@ -1,0 +1,41 @@
+"""Hybrid search: Optuna looks around, gradients leap from the best it found, and it learns from them.
+
+After BO-Leap (Antonova et al. 2022): the landscape is rugged with useful local gradients, so a
+global model chooses where to start and gradients finish the job. Steps of a leap are told back to
+the study as trials.
+"""
+
+from __future__ import annotations
+
+from design import bayes
+from design.campaign import Campaign
+from design.distinct import apart
+from design.gradient import STEP, descend, require_gradient
+
+#: Share of the budget that is sampled before the first leap, and the share of each leap.
+EXPLORE, LEAP = 0.5, 0.375
+#: Most chains of one leap, and the fewest gradients of a chain: long chains from few starts beat
+#: single steps from many.
+CHAINS, LEAST_GRADIENTS = 4, 3
+
+
+def search(campaign: Campaign) -> None:
+    """Half of the budget on sampling, then leaps and batches by turns.
+
+    Raises:
+        SimulatorError: if the simulator has no gradient.
+    """
+    require_gradient(campaign)
+    bayes.search(campaign, until=round(EXPLORE * campaign.budget))
+    while campaign.left() > 0:
+        leap(campaign)
+        bayes.search(campaign, until=campaign.log.spent() + campaign.batch)
+
+
+def leap(campaign: Campaign) -> None:
+    """Gradient steps from the best layouts that no gradient has been taken at or near."""
+    budget = min(round(LEAP * campaign.budget), campaign.left())
+    count = min(CHAINS, budget // (2 * LEAST_GRADIENTS))
+    trials = sorted((t for t in campaign.log.trials() if t.ok), key=lambda t: t.cost)
+    leapt = [t.centres for t in trials if t.origin == "gradient"]
+    descend(campaign, apart([t.centres for t in trials], STEP, count, avoid=leapt), budget)

@@ -1,0 +1,305 @@
+"""The trials of a search, kept in an Optuna study: one store for every method, on one machine or many.
+
+Baselines, sampled layouts and gradient steps all end as trials of one study in RDB storage (SQLite
+in the run folder by default, PostgreSQL across machines), so a search resumes, is shared and is
+looked at with Optuna's own tools, whichever method made the trials.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import json
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import optuna
+from optuna.trial import FrozenTrial, TrialState
+
+from design.parameters import names, ordered, to_centres, to_parameters
+from gns_env.layout import LayoutSpace
+from gns_model.errors import GnsError
+from gns_model.scene import write_whole
+
+optuna.logging.set_verbosity(optuna.logging.ERROR)
+
+
+class StudyError(GnsError):
+    """A study that cannot be opened, or that belongs to another task."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What running one layout gave.
+
+    Attributes:
+        cost: the objective, relative to no baffles [-]; a finite penalty if the rollout failed.
+        measures: hard measures, `gns_model.measures.summary`; empty if the rollout failed.
+        status: "ok" or how the rollout failed.
+        rollouts: forward rollouts spent.
+        backwards: backward passes through a rollout spent.
+        seconds: spent on it.
+        gradient: d(smooth cost)/d(centres) [1/m], shape (n, D-1), if it was asked for.
+    """
+
+    cost: float
+    measures: dict[str, float]
+    status: str = "ok"
+    rollouts: int = 1
+    backwards: int = 0
+    seconds: float = 0.0
+    gradient: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One layout that was tried: `centres` [m], shape (n, D-1), where it came from, its outcome."""
+
+    number: int
+    origin: str
+    centres: np.ndarray
+    outcome: Outcome
+
+    @property
+    def cost(self) -> float:
+        """The objective, relative to no baffles [-]."""
+        return self.outcome.cost
+
+    @property
+    def ok(self) -> bool:
+        """Whether the rollout reached its end."""
+        return self.outcome.status == "ok"
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A layout that the study waits for: run it, then `tell`."""
+
+    number: int
+    origin: str
+    centres: np.ndarray
+
+
+class TrialLog:
+    """An Optuna study seen as layouts: ask for some, tell what they gave, look at all."""
+
+    def __init__(self, study: optuna.Study, space: LayoutSpace) -> None:
+        self.study, self.space = study, space
+        self.distributions: dict[str, optuna.distributions.BaseDistribution] = {
+            name: optuna.distributions.FloatDistribution(0.0, 1.0) for name in names(space)
+        }
+        self._asked: dict[int, optuna.Trial] = {}
+
+    @classmethod
+    def open(
+        cls,
+        storage: str,
+        name: str,
+        space: LayoutSpace,
+        task: dict[str, Any],
+        *,
+        resume: bool,
+        owned: bool,
+    ) -> TrialLog:
+        """Create or resume the study `name` in `storage`.
+
+        Args:
+            task: what is searched (scene, number of baffles, objective, simulator), plain values:
+                a study of another task is refused.
+            resume: go on with a study that exists.
+            owned: nobody else uses the storage, so trials left running are leftovers of a crash.
+
+        Raises:
+            StudyError: if the storage cannot be reached, the study exists and `resume` is not set,
+                or it belongs to another task.
+        """
+        with storage_errors(storage):
+            arguments = {"timeout": 60} if storage.startswith("sqlite") else {}
+            backend = optuna.storages.RDBStorage(
+                storage, engine_kwargs={"connect_args": arguments, "pool_pre_ping": True}
+            )
+            try:
+                study = optuna.create_study(
+                    storage=backend, study_name=name, direction="minimize", load_if_exists=resume
+                )
+            except optuna.exceptions.DuplicatedStudyError:
+                raise StudyError(
+                    f"{storage} already holds the study {name!r}: go on with --resume, or choose "
+                    "another --out or --storage"
+                ) from None
+            known = study.user_attrs.get("task")
+            if known is None:
+                study.set_user_attr("task", json.dumps(task))
+            else:
+                _same_task(json.loads(known), json.loads(json.dumps(task)))
+            if owned:
+                for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
+                    study.tell(trial.number, state=TrialState.FAIL)
+        return cls(study, space)
+
+    def ask(
+        self, count: int, sampler: optuna.samplers.BaseSampler, origin: str = "bayes"
+    ) -> list[Proposal]:
+        """`count` layouts to run: those enqueued first, then the sampler's, all buildable."""
+        self.study.sampler = sampler
+        proposals = []
+        for _ in range(count):
+            trial = self.study.ask(self.distributions)
+            centres = self.buildable(to_centres(self.space, trial.params))
+            source = trial.user_attrs.get("origin", origin)
+            self._asked[trial.number] = trial
+            proposals.append(Proposal(trial.number, source, centres))
+        return proposals
+
+    def enqueue(self, origin: str, centres: np.ndarray) -> None:
+        """Have `ask` return a layout before the sampler's own, unless it was tried already."""
+        centres = self.buildable(centres)
+        if any(np.allclose(t.centres, centres, atol=1e-6) for t in self.trials()):
+            return
+        self.study.enqueue_trial(
+            to_parameters(self.space, centres), user_attrs={"origin": origin}, skip_if_exists=True
+        )
+
+    def tell(self, proposal: Proposal, outcome: Outcome) -> Trial:
+        """Record what a proposal gave. A failure is told with its finite penalty."""
+        trial = self._asked.pop(proposal.number)
+        trial.set_user_attr("record", _record(proposal.origin, proposal.centres, outcome))
+        self.study.tell(trial, outcome.cost)
+        return Trial(proposal.number, proposal.origin, proposal.centres, outcome)
+
+    def add(self, origin: str, centres: np.ndarray, outcome: Outcome) -> Trial:
+        """Record a layout that the study did not ask for, so that its sampler learns from it."""
+        centres = self.buildable(centres)
+        self.study.add_trial(
+            optuna.create_trial(
+                params=to_parameters(self.space, centres),
+                distributions=self.distributions,
+                value=outcome.cost,
+                user_attrs={"record": _record(origin, centres, outcome)},
+            )
+        )
+        return Trial(len(self.study.get_trials(deepcopy=False)) - 1, origin, centres, outcome)
+
+    def abandon(self) -> None:
+        """Mark what was asked for and will not be told, so that nobody waits for it."""
+        for trial in self._asked.values():
+            self.study.tell(trial, state=TrialState.FAIL)
+        self._asked.clear()
+
+    def buildable(self, centres: np.ndarray) -> np.ndarray:
+        """The nearest layout that holds every constraint, numbered across the flow."""
+        centres = np.asarray(centres, dtype=float)
+        if not self.space.check(centres):
+            return ordered(centres)
+        return ordered(np.asarray(self.space.project(centres), dtype=float))
+
+    def trials(self) -> list[Trial]:
+        """Everything that was tried, in the order it was asked for."""
+        finished = self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+        return [trial for trial in map(_trial, finished) if trial is not None]
+
+    def best(self) -> Trial | None:
+        """The trial of least cost among those whose rollout reached its end."""
+        return min((t for t in self.trials() if t.ok), key=lambda t: t.cost, default=None)
+
+    def spent(self) -> int:
+        """Passes through a rollout so far: forward and backward ones, each counts one."""
+        return sum(t.outcome.rollouts + t.outcome.backwards for t in self.trials())
+
+    def write_csv(self, path: Path) -> None:
+        """All trials as a table: number, origin, cost, measures, centres [m]."""
+        write_whole(path, table(self.trials()).encode())
+
+
+def table(trials: Sequence[Trial]) -> str:
+    """Trials as CSV text with a header."""
+    measures = list(dict.fromkeys(name for t in trials for name in t.outcome.measures))
+    axes = ("x", "z")
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    columns = [
+        f"{axes[j]}{k + 1}"
+        for k in range(max((len(t.centres) for t in trials), default=0))
+        for j in range(trials[0].centres.shape[1])
+    ]
+    writer.writerow(
+        ["number", "origin", "status", "cost", *measures, *columns]
+        + ["rollouts", "backwards", "seconds"]
+    )
+    for t in trials:
+        o = t.outcome
+        writer.writerow(
+            [t.number, t.origin, o.status, repr(float(o.cost))]
+            + [repr(float(o.measures[m])) if m in o.measures else "" for m in measures]
+            + [f"{c:.6f}" for c in t.centres.ravel()]
+            + [o.rollouts, o.backwards, f"{o.seconds:.3f}"]
+        )
+    return text.getvalue()
+
+
+@contextlib.contextmanager
+def storage_errors(storage: str) -> Iterator[None]:
+    """Turn what a database can throw (unreachable, full disk, foreign file) into a StudyError."""
+    from sqlalchemy.exc import SQLAlchemyError
+
+    try:
+        yield
+    except (SQLAlchemyError, optuna.exceptions.StorageInternalError, ImportError) as error:
+        cause: BaseException = error
+        while cause.__cause__ is not None:
+            cause = cause.__cause__
+        # The address may carry a password: name the kind and the place only.
+        place = storage.rsplit("@", 1)[-1]
+        raise StudyError(f"study storage {place}: {cause or type(cause).__name__}") from error
+    except (RuntimeError, ValueError) as error:
+        if isinstance(error, GnsError) or "optuna" not in str(error).lower():
+            raise
+        raise StudyError(f"study storage {storage.rsplit('@', 1)[-1]}: {error}") from error
+
+
+def sqlite_url(path: str | os.PathLike[str]) -> str:
+    """The storage address of an SQLite file."""
+    return f"sqlite:///{Path(path).resolve()}"
+
+
+def _record(origin: str, centres: np.ndarray, outcome: Outcome) -> dict[str, Any]:
+    return {
+        "origin": origin,
+        "centres": np.asarray(centres).tolist(),
+        "measures": outcome.measures,
+        "status": outcome.status,
+        "rollouts": outcome.rollouts,
+        "backwards": outcome.backwards,
+        "seconds": outcome.seconds,
+    }
+
+
+def _trial(frozen: FrozenTrial) -> Trial | None:
+    record = frozen.user_attrs.get("record")
+    if record is None or frozen.value is None:
+        return None
+    outcome = Outcome(
+        cost=float(frozen.value),
+        measures=dict(record["measures"]),
+        status=str(record["status"]),
+        rollouts=int(record["rollouts"]),
+        backwards=int(record["backwards"]),
+        seconds=float(record["seconds"]),
+    )
+    return Trial(frozen.number, str(record["origin"]), np.array(record["centres"]), outcome)
+
+
+def _same_task(known: dict[str, Any], asked: dict[str, Any]) -> None:
+    for key in asked:
+        if known.get(key) != asked[key]:
+            detail = (
+                "" if isinstance(asked[key], dict) else f" ({known.get(key)!r}, now {asked[key]!r})"
+            )
+            raise StudyError(
+                f"the study to resume has another {key}{detail}: choose another --out"
+            )

@@ -1,0 +1,176 @@
+"""The best layouts on the reference solver, and how far the search's simulator was off.
+
+A surrogate's optimum is also where its errors are most flattering, so designs are ranked anew by the
+reference solver before one is called best (findings/FIELD.md), and the gap is printed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from design.distinct import apart
+from design.trials import Trial
+from gns_env.objective import Objective
+
+
+@dataclass
+class Judged:
+    """One layout as both simulators see it.
+
+    Attributes:
+        origin: which part of the search proposed it; "scene" is the scene's own, "none" no baffles.
+        centres: [m], shape (n, D-1).
+        surrogate, verified: hard measures by the search's simulator and by the reference solver;
+            empty where that one has not run or has failed.
+        cost, verified_cost: the objective by each, relative to its own rollout without baffles.
+    """
+
+    origin: str
+    centres: np.ndarray
+    surrogate: dict[str, float]
+    cost: float | None = None
+    verified: dict[str, float] | None = None
+    verified_cost: float | None = None
+    verified_status: str | None = None
+
+    def judge(
+        self, status: str, verified: dict[str, float], reference: dict[str, float], by: Objective
+    ) -> None:
+        """Take in what the reference solver says."""
+        self.verified_status = status
+        if status == "ok":
+            self.verified = verified
+            self.verified_cost = by.cost(verified, reference)
+        else:
+            self.verified_cost = by.failure_cost
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for summary.json."""
+        return {
+            "layout": np.round(self.centres, 6).tolist(),
+            "origin": self.origin,
+            "cost": self.cost,
+            "surrogate": self.surrogate,
+            "verified_cost": self.verified_cost,
+            "verified": self.verified,
+            "verified_status": self.verified_status,
+        }
+
+
+def candidates(
+    trials: Sequence[Trial], count: int, least: float, *, avoid: Sequence[np.ndarray] = ()
+) -> list[Judged]:
+    """The `count` best trials, at least `least` [m] apart from each other and from `avoid`.
+
+    Neighbours of the best would only verify the same thing again.
+    """
+    ranked = sorted((t for t in trials if t.ok), key=lambda t: (t.cost, t.number))
+    chosen = apart([t.centres for t in ranked], least, count, avoid=avoid)
+    by_layout = {id(t.centres): t for t in ranked}
+    return [
+        Judged(t.origin, t.centres, dict(t.outcome.measures), t.cost)
+        for t in (by_layout[id(c)] for c in chosen)
+    ]
+
+
+def rank(judged: Sequence[Judged]) -> list[Judged]:
+    """Best first: by verified cost, what is not verified behind it by the search's cost."""
+    return sorted(
+        judged,
+        key=lambda j: (
+            j.verified_cost is None,
+            j.verified_cost if j.verified_cost is not None else (j.cost or 0.0),
+        ),
+    )
+
+
+def gap(judged: Sequence[Judged]) -> dict[str, dict[str, float]]:
+    """How the two simulators differ over the layouts that both have judged.
+
+    Returns:
+        for "cost" and each measure: `mean_relative` and `max_relative`, of |surrogate - verified| /
+        |verified|, and `spearman`, the rank correlation over three layouts at least (else left out).
+    """
+    both = [j for j in judged if j.verified and j.surrogate]
+    result: dict[str, dict[str, float]] = {}
+    names = list(both[0].verified or ()) if both else []
+    for name in ["cost", *names]:
+        if name == "cost":
+            pairs = [(j.cost, j.verified_cost) for j in both if j.origin != "none"]
+        else:
+            # Without baffles two simulators measure another depth and no overtopping at all.
+            pairs = [(j.surrogate.get(name), (j.verified or {}).get(name)) for j in both]
+        known = [(s, v) for s, v in pairs if s is not None and v is not None]
+        if not known:
+            continue
+        s, v = np.array(known, dtype=float).T
+        relative = np.abs(s - v) / np.maximum(np.abs(v), 1e-12)
+        relative = relative[np.abs(v) > 1e-9]
+        entry = {"layouts": float(len(known))}
+        if len(relative):
+            entry |= {
+                "mean_relative": float(relative.mean()),
+                "max_relative": float(relative.max()),
+            }
+        correlation = spearman(s, v)
+        if correlation is not None:
+            entry["spearman"] = correlation
+        result[name] = entry
+    return result
+
+
+def spearman(a: np.ndarray, b: np.ndarray) -> float | None:
+    """Rank correlation of two samples (n,), or None below three or where one is constant."""
+    from scipy.stats import rankdata
+
+    if len(a) < 3 or np.ptp(a) == 0 or np.ptp(b) == 0:
+        return None
+    value = float(np.corrcoef(rankdata(a), rankdata(b))[0, 1])
+    return value if math.isfinite(value) else None
+
+
+def verdict(best: Judged | None, paper: Judged | None, none: float) -> tuple[str, str]:
+    """One of "better", "not better", "unverified", "no comparison", and a sentence that says so.
+
+    Args:
+        best: the best of the search.
+        paper: the scene's own layout, if it has one.
+        none: the cost of no baffles.
+    """
+    if best is None:
+        return "unverified", "The search found no layout whose rollout reached its end."
+    if best.verified_cost is None:
+        return "unverified", (
+            "No layout was verified on the reference solver: the best is only the best that the "
+            f"search's simulator saw (cost {best.cost:.4f})."
+        )
+    if best.verified is None:
+        return "unverified", (
+            "Every rollout of a proposed layout on the reference solver failed: nothing found can "
+            "be recommended."
+        )
+    relative = _change(best.verified_cost, none)
+    if paper is None or paper.verified_cost is None:
+        return "no comparison", (
+            f"Verified cost {best.verified_cost:.4f}, {relative} no baffles; there is no layout of "
+            "the scene's own to compare with."
+        )
+    costs = f"verified cost {best.verified_cost:.4f} against {paper.verified_cost:.4f}"
+    if best.verified_cost < paper.verified_cost:
+        return "better", (
+            f"The best layout found is better than the scene's own: {costs}, {relative} no baffles."
+        )
+    return "not better", (
+        f"NOT better than the scene's own layout: {costs}. Keep the scene's own, or search with a "
+        "larger budget."
+    )
+
+
+def _change(value: float, reference: float) -> str:
+    share = 100 * (value / reference - 1)
+    return f"{abs(share):.1f}% {'below' if share <= 0 else 'above'}"

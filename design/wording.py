@@ -1,0 +1,86 @@
+"""How a number is called and written for a person: names, units, digits, changes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gns_model.scene import Scene
+
+#: Relative changes below this are called no change: less than the solver's own repeatability.
+NEGLIGIBLE = 0.005
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A measure as it is shown: value in SI times `factor`, with `digits` decimals of `unit`."""
+
+    name: str
+    title: str
+    unit: str
+    factor: float
+    digits: int
+    #: -1: less is better; +1: more is better; 0: reported only.
+    sense: int
+    explanation: str
+
+    def text(self, value: float | None, *, unit: bool = True) -> str:
+        """The value as text; an en dash where there is none."""
+        if value is None:
+            return "–"
+        number = f"{value * self.factor:.{self.digits}f}".replace("-", "−")
+        return f"{number} {self.unit}" if unit else number
+
+
+def quantities(scene: Scene | None) -> list[Quantity]:
+    """The measures in the order of the report: the objective's first, the paper's runout last."""
+    section = f"x = {scene.control_section:.2f} m" if scene else "the control section"
+    energy = "J" if scene is None or scene.dim == 3 else "J/m"
+    return [
+        Quantity("centroid_travel", "Centroid travel", "m", 1, 3, -1,
+                 "How far the centre of mass has moved downstream at the end. Objective."),
+        Quantity("upstream_depth", "Peak depth upstream of a baffle", "m", 1, 3, -1,
+                 "Deepest flow in the 10 cm before a baffle; without baffles the deepest in "
+                 "windows of the same size. Objective."),
+        Quantity("runout_p99", "Runout, 99th percentile", "m", 1, 3, -1,
+                 "Travel of the front that 1% of the mass lies beyond."),
+        Quantity("mass_past_section", f"Mass past {section}", "%", 100, 2, -1,
+                 "Share of the mass beyond the control section at the end."),
+        Quantity("overtopping", "Mass over a baffle's top", "%", 100, 2, -1,
+                 "Share of the mass that crossed above the plan of a baffle at some time."),
+        Quantity("energy_dissipated", "Energy dissipated", energy, 1, 0, 1,
+                 "Potential and kinetic energy lost between start and end."),
+        Quantity("runout_max", "Farthest grain", "m", 1, 3, 0,
+                 "The paper's runout. Single grains decide it: reported, never optimised."),
+    ]
+
+
+def change(value: float | None, reference: float | None) -> float | None:
+    """(value - reference) / |reference|, or None where that says nothing."""
+    if value is None or reference is None or abs(reference) < 1e-12:
+        return None
+    return (value - reference) / abs(reference)
+
+
+def percent(share: float | None, digits: int = 1) -> str:
+    """A signed share as per cent, with a true minus; an en dash where there is none."""
+    if share is None:
+        return "–"
+    return f"{100 * share:+.{digits}f} %".replace("-", "−")
+
+
+def verdict(share: float | None, sense: int) -> str:
+    """"better", "worse", "same", or "" where neither is meant."""
+    if share is None or sense == 0:
+        return ""
+    if abs(share) < NEGLIGIBLE:
+        return "same"
+    return "better" if share * sense > 0 else "worse"
+
+
+def duration(seconds: float) -> str:
+    """12.3 s, 4 min 05 s, 2 h 10 min."""
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    if seconds < 3600:
+        return f"{int(seconds // 60)} min {int(seconds % 60):02d} s"
+    return f"{int(seconds // 3600)} h {int(seconds % 3600 // 60):02d} min"

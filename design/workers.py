@@ -1,0 +1,160 @@
+"""Processes of one thread each: how a search and its verification fill a CPU.
+
+Small matrix products scale badly over threads and well over processes (findings/SPEED.md), and one
+pool for both kinds of work lets the reference solver start while the search goes on. Jobs are plain
+functions of plain arguments; results are small (measures, not positions).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any
+
+from gns_model.errors import SimulatorError
+
+_THREADS = {
+    name: "1"
+    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+}
+_fractions: Any = None  # in a worker: one double a slot, how far the job in it has come
+SLOTS = 256
+
+
+class WorkerError(SimulatorError):
+    """A worker process died, most likely for want of memory."""
+
+
+class Workers:
+    """A pool of one-thread processes whose jobs report how far they are.
+
+    Use as a context manager: leaving it ends the processes, at once if by an error or an interrupt.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        context = multiprocessing.get_context("spawn")
+        self._fractions = context.Array("d", SLOTS, lock=False)
+        self._free = list(range(SLOTS))
+        with _environment(_THREADS):
+            self._pool = ProcessPoolExecutor(
+                count, mp_context=context, initializer=_start, initargs=(self._fractions,)
+            )
+
+    def submit(self, job: Callable[..., Any], *arguments: Any) -> Job:
+        """Queue `job(*arguments, slot)`; a worker calls it with a slot for `report`."""
+        slot = self._free.pop(0) if self._free else SLOTS - 1
+        self._fractions[slot] = 0.0
+        try:
+            with _environment(_THREADS):  # the pool starts a process when a job needs one
+                future = self._pool.submit(job, *arguments, slot)
+        except BrokenProcessPool:
+            raise WorkerError(_DIED) from None
+        future.add_done_callback(lambda _: self._free.append(slot))
+        return Job(future, self._fractions, slot)
+
+    def __enter__(self) -> Workers:
+        return self
+
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        processes = list((self._pool._processes or {}).values())
+        if kind is not None:
+            for process in processes:
+                process.terminate()
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+
+class Job:
+    """A job under way."""
+
+    def __init__(self, future: Future[Any], fractions: Any, slot: int) -> None:
+        self._future, self._fractions, self._slot = future, fractions, slot
+
+    @property
+    def done(self) -> bool:
+        """Whether it ended, well or not."""
+        return self._future.done()
+
+    @property
+    def fraction(self) -> float:
+        """How far it is, 0 to 1."""
+        return 1.0 if self.done else min(float(self._fractions[self._slot]), 1.0)
+
+    def result(self) -> Any:
+        """What it returned; waits for it.
+
+        Raises:
+            WorkerError: if its process died; else whatever the job raised.
+        """
+        try:
+            return self._future.result()
+        except BrokenProcessPool:
+            raise WorkerError(_DIED) from None
+
+
+def as_completed(jobs: list[Job], watch: Callable[[], None] | None = None) -> Iterator[int]:
+    """Indices of `jobs` as they end; `watch` is called twice a second meanwhile."""
+    left = {job._future: k for k, job in enumerate(jobs)}
+    while left:
+        # A short wait also lets Ctrl-C through at once.
+        ended, _ = wait(left, timeout=0.5, return_when=FIRST_COMPLETED)
+        if watch is not None:
+            watch()
+        for future in sorted(ended, key=left.__getitem__):
+            yield left.pop(future)
+
+
+def report(slot: int) -> Callable[[float], None]:
+    """In a worker: a progress callback that writes to `slot`."""
+
+    def write(fraction: float) -> None:
+        if _fractions is not None:
+            _fractions[slot] = fraction
+
+    return write
+
+
+def default_count() -> int:
+    """The cores that this process may use."""
+    with contextlib.suppress(AttributeError):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+_DIED = (
+    "a worker process died (out of memory?): what was finished is kept; go on with --resume and "
+    "fewer --workers"
+)
+
+
+def _start(fractions: Any) -> None:
+    global _fractions
+    _fractions = fractions
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what an interrupt means
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
+    import torch
+
+    torch.set_num_threads(1)
+
+
+@contextlib.contextmanager
+def _environment(values: dict[str, str]) -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value

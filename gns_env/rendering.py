@@ -1,0 +1,238 @@
+"""Plan and side views of a trajectory, drawn with matplotlib's Agg canvas.
+
+The plan shows the depth of material in every cell of the base, the side view every grain coloured
+by its speed. A `View` keeps its figure and only moves the data, so that a film of a flow costs tens
+of milliseconds a frame.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LinearSegmentedColormap, to_rgba
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from gns_model.measures import moving_positions
+from gns_model.scene import Scene
+from gns_model.trajectory import Trajectory
+
+INK, MUTED, HAIRLINE = "#1d1b18", "#6d675d", "#cfc8bc"
+BAFFLE, GROUND = "#2f4858", "#f6f3ee"
+SAND = LinearSegmentedColormap.from_list(
+    "sand", [GROUND, "#ecdcb8", "#dcae5c", "#b8722c", "#7c3f17", "#42200d"]
+)
+SPEED = LinearSegmentedColormap.from_list("speed", ["#7c5a36", "#c98f45", "#e8c07a", "#5fb0c9"])
+#: Speed [m/s] at the top of the colour scale: that of the paper's release.
+TOP_SPEED = 2.0
+#: Depth [m] below which the plan shows the ground: less than a layer of single grains.
+LEAST_DEPTH = 0.002
+#: A rendered frame [inch], at DPI dots an inch: its width, that of a view, and the margins.
+WIDTH, VIEW, LEFT, TOP, BOTTOM, BETWEEN, DPI = 6.4, 4.9, 0.62, 0.42, 0.5, 0.22, 100
+#: Views of very long or very short domains are kept between these heights [inch].
+SHORTEST, TALLEST = 0.6, 6.0
+
+
+def depth_map(trajectory: Trajectory, frame: int, cell: float) -> NDArray[np.float64]:
+    """Depth of material over the plan [m], cells of about `cell` [m], shape (nx,) or (nx, nz).
+
+    It is the volume of the points in a cell over its area, so it conserves mass; points outside
+    the domain (of a rollout that failed) are left out.
+    """
+    scene = trajectory.scene
+    plan = [0, *range(2, scene.dim)]
+    lower, upper = np.array(scene.domain.lower)[plan], np.array(scene.domain.upper)[plan]
+    shape = np.maximum(np.rint((upper - lower) / cell).astype(int), 1)
+    points = moving_positions(trajectory)[frame][:, plan]
+    counts, _ = np.histogramdd(points, bins=list(shape), range=list(zip(lower, upper, strict=True)))
+    return counts * (trajectory.point_volume / np.prod((upper - lower) / shape))
+
+
+def plan_view(axes: Axes, trajectory: Trajectory, frame: int = -1) -> PlanView:
+    """Draw depth, baffles and control section in plan, x to the right and z up (3D scenes)."""
+    view = PlanView(axes, trajectory)
+    view.show(frame)
+    return view
+
+
+def side_view(axes: Axes, trajectory: Trajectory, frame: int = -1) -> SideView:
+    """Draw grains by speed, baffles and control section from the side, x to the right and y up."""
+    view = SideView(axes, trajectory)
+    view.show(frame)
+    return view
+
+
+def frame_image(trajectory: Trajectory, frame: int = -1) -> NDArray[np.uint8]:
+    """One frame as RGB, shape (H, W, 3); for many frames of one trajectory keep a `Film`."""
+    return Film(trajectory).image(frame)
+
+
+class PlanView:
+    """The plan of one trajectory in `axes`; `show(frame)` moves it to a frame."""
+
+    def __init__(self, axes: Axes, trajectory: Trajectory) -> None:
+        scene = trajectory.scene
+        if scene.dim != 3:
+            raise ValueError("a 2D scene has no plan")
+        self.trajectory = trajectory
+        # Cells as wide as the grains' first distance, then blurred by about one: no moiré.
+        self.cell = trajectory.point_volume ** (1 / 3)
+        lower, upper = scene.domain.lower, scene.domain.upper
+        top = max([r.upper[1] - scene.base for r in scene.releases])
+        self.image = axes.imshow(
+            np.zeros((2, 2)),
+            extent=(lower[0], upper[0], lower[2], upper[2]),
+            origin="lower",
+            cmap=SAND,
+            vmin=0.0,
+            vmax=0.8 * top,
+            interpolation="bicubic",
+        )
+        for low, high in scene.baffle_boxes():
+            axes.add_patch(_box(low[[0, 2]], high[[0, 2]]))
+        for r in scene.releases:
+            corner, size = (r.lower[0], r.lower[2]), (r.size[0], r.size[2])
+            axes.add_patch(Rectangle(corner, *size, fill=False, ec=MUTED, lw=0.8, ls=(0, (3, 2))))
+        label = axes.annotate(
+            "section",
+            (scene.control_section, upper[2]),
+            (3, -3),
+            textcoords="offset points",
+            color=MUTED,
+            fontsize=7.5,
+            va="top",
+        )
+        label.set_zorder(4)
+        _dress(axes, trajectory, "z [m]", (lower[2], upper[2]))
+
+    def show(self, frame: int) -> None:
+        depth = gaussian_filter(depth_map(self.trajectory, frame, self.cell), 0.9, mode="reflect")
+        self.image.set_data(np.where(depth < LEAST_DEPTH, 0.0, depth).T)
+
+
+class SideView:
+    """The side of one trajectory in `axes`; `show(frame)` moves it to a frame."""
+
+    def __init__(self, axes: Axes, trajectory: Trajectory) -> None:
+        scene = trajectory.scene
+        self.trajectory, self.positions = trajectory, moving_positions(trajectory)
+        top = _side_top(scene)
+        # Grains at the far side wall are drawn first, the near ones over them.
+        order = np.argsort(self.positions[0, :, 2]) if scene.dim == 3 else slice(None)
+        self.positions = self.positions[:, order]
+        # In 3D baffles stand at different depths of the view: the flow is drawn over pale ones.
+        for low, high in scene.baffle_boxes():
+            axes.add_patch(_box(low[:2], high[:2], pale=scene.dim == 3))
+        self.points = axes.scatter(
+            self.positions[0, :, 0],
+            self.positions[0, :, 1],
+            c=np.zeros(self.positions.shape[1]),
+            cmap=SPEED,
+            vmin=0.0,
+            vmax=TOP_SPEED,
+            linewidths=0,
+            zorder=2,
+        )
+        _dress(axes, trajectory, "y [m]", (scene.base, top))
+        # A grain is drawn about as large as it is, on the axes as they are when first shown.
+        width = axes.get_window_extent().width / axes.figure.dpi
+        grain = 72 * width / scene.domain.size[0] * trajectory.point_volume ** (1 / scene.dim)
+        self.points.set_sizes([min(max(0.6 * grain, 1.0), 6.0) ** 2])
+
+    def show(self, frame: int) -> None:
+        frame %= len(self.positions)
+        before = max(frame - 1, 0)
+        interval = float(self.trajectory.time[max(frame, 1)] - self.trajectory.time[before])
+        moved = self.positions[max(frame, 1)] - self.positions[before]
+        self.points.set_offsets(self.positions[frame, :, :2])
+        self.points.set_array(np.linalg.norm(moved, axis=1) / interval)
+
+
+class Film:
+    """Frames of one trajectory as images, plan above side; the figure is drawn once."""
+
+    def __init__(self, trajectory: Trajectory) -> None:
+        scene = trajectory.scene
+        self.trajectory = trajectory
+        heights = [_side_top(scene) - scene.base]
+        if scene.dim == 3:
+            heights.insert(0, scene.domain.size[2])
+        inches = [min(max(h * VIEW / scene.domain.size[0], SHORTEST), TALLEST) for h in heights]
+        height = TOP + sum(inches) + BETWEEN * (len(inches) - 1) + BOTTOM
+        self.figure = Figure(figsize=(WIDTH, round(height, 2)), dpi=DPI, facecolor="white")
+        self.canvas = FigureCanvasAgg(self.figure)
+        self.views: list[PlanView | SideView] = []
+        top = height - TOP
+        for k, inch in enumerate(inches):
+            box = (LEFT / WIDTH, (top - inch) / height, VIEW / WIDTH, inch / height)
+            axes = self.figure.add_axes(box)
+            bar = self.figure.add_axes((box[0] + box[2] + 0.02, box[1], 0.018, box[3]))
+            top -= inch + BETWEEN
+            if len(inches) == 2 and k == 0:
+                plan = PlanView(axes, trajectory)
+                axes.tick_params(labelbottom=False)
+                axes.set_xlabel("")
+                self.views.append(plan)
+                _colour_bar(bar, plan.image, "depth [m]")
+            else:
+                side = SideView(axes, trajectory)
+                self.views.append(side)
+                _colour_bar(bar, side.points, "speed [m/s]")
+        self.title = self.figure.text(
+            LEFT / WIDTH, 1 - 0.6 * TOP / height, "", color=INK, fontsize=10.5, weight="bold"
+        )
+
+    def image(self, frame: int) -> NDArray[np.uint8]:
+        """RGB of one frame, shape (H, W, 3), freshly allocated."""
+        for view in self.views:
+            view.show(frame)
+        name, time = self.trajectory.scene.name, self.trajectory.time[frame]
+        self.title.set_text(f"{name} ({self.trajectory.simulator}), t = {time:.2f} s")
+        self.canvas.draw()
+        return np.asarray(self.canvas.buffer_rgba())[:, :, :3].copy()
+
+
+def _side_top(scene: Scene) -> float:
+    """Height to which a side view is worth drawing [m]: hardly anything is ever seen above it."""
+    heights = [r.upper[1] for r in scene.releases] + [b[1, 1] for b in scene.baffle_boxes()]
+    return float(min(scene.domain.upper[1], scene.base + 1.3 * (max(heights) - scene.base)))
+
+
+def _box(low: NDArray[np.float64], high: NDArray[np.float64], pale: bool = False) -> Rectangle:
+    colours = (to_rgba(BAFFLE, 0.28), BAFFLE) if pale else (BAFFLE, "white")
+    return Rectangle(
+        (low[0], low[1]),
+        *(high - low),
+        facecolor=colours[0],
+        edgecolor=colours[1],
+        lw=0.8,
+        zorder=1 if pale else 3,
+    )
+
+
+def _colour_bar(axes: Axes, mappable: ScalarMappable, label: str) -> None:
+    bar = axes.figure.colorbar(mappable, cax=axes, extend="max")
+    bar.outline.set_visible(False)  # type: ignore[operator]
+    bar.locator = MaxNLocator(5 if axes.get_position().height > 0.4 else 2, steps=[1, 2, 5, 10])
+    bar.set_label(label, color=MUTED, fontsize=8.5)
+    axes.tick_params(color=HAIRLINE, labelcolor=MUTED, labelsize=8, length=2.5)
+
+
+def _dress(axes: Axes, trajectory: Trajectory, label: str, y: tuple[float, float]) -> None:
+    scene = trajectory.scene
+    axes.axvline(scene.control_section, color=MUTED, lw=0.9, ls=(0, (1, 2)), zorder=4)
+    axes.set(xlim=(scene.domain.lower[0], scene.domain.upper[0]), ylim=y, aspect="equal")
+    axes.set_facecolor(GROUND)
+    axes.set_xlabel("x [m]", color=MUTED, fontsize=8.5, labelpad=2)
+    axes.set_ylabel(label, color=MUTED, fontsize=8.5, labelpad=2)
+    axes.yaxis.set_major_locator(
+        MaxNLocator(9 if axes.get_position().height > 0.4 else 3, steps=[1, 2, 5, 10])
+    )
+    axes.tick_params(color=HAIRLINE, labelcolor=MUTED, labelsize=8, length=2.5)
+    for spine in axes.spines.values():
+        spine.set_color(HAIRLINE)

@@ -1,0 +1,1 @@
+"""Data: random scenes, their generation in parallel, and windows for training."""

@@ -1,0 +1,174 @@
+"""What a learned simulator is built like, and what it was trained for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from gns_model.scene import Scene
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Range = tuple[float, float]
+
+#: Number of particle types in geoelements/gns; 6 moves and 3 is stationary.
+PAPER_TYPES = 9
+
+
+class Limits(BaseModel):
+    """The range of scenes that a model was trained on; outside it, it guesses.
+
+    Every field is None (no limit known) or an upper bound, or a (lowest, highest) pair.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    max_speed: float | None = None  #: of a release [m/s]
+    release_height: float | None = None  #: highest top of a release over the base [m]
+    gravity: Range | None = None  #: magnitude [m/s²]
+    slope: Range | None = None  #: angle of gravity to -y [degrees]
+    friction_angle: Range | None = None  #: [degrees]
+    cohesion: Range | None = None  #: [Pa]
+    base_friction: Range | None = None  #: [-]
+    wall_friction: Range | None = None  #: [-]
+    baffle_friction: Range | None = None  #: [-]
+    baffle_height: Range | None = None  #: [m]
+    baffle_width: Range | None = None  #: both plan sizes [m]
+
+    @classmethod
+    def of(cls, scenes: Iterable[Scene]) -> Limits:
+        """The limits that just hold `scenes`, to be written into a card after training on them."""
+        seen = [_extent(scene) for scene in scenes]
+        limits: dict[str, float | Range] = {}
+        for name in cls.model_fields:
+            values = [v for extent in seen for v in extent.get(name, ())]
+            if values:
+                single = name in ("max_speed", "release_height")
+                limits[name] = max(values) if single else (min(values), max(values))
+        return cls(**limits)
+
+    def broken_by(self, scene: Scene) -> list[str]:
+        """One line for every limit that `scene` lies outside of, naming it, value and range."""
+        lines = []
+        for name, values in _extent(scene).items():
+            limit = getattr(self, name)
+            if limit is None:
+                continue
+            low, high = limit if isinstance(limit, tuple) else (0.0, limit)
+            slack = 1e-6 + 0.01 * max(abs(low), abs(high))
+            worst = max(values, key=lambda v: max(low - v, v - high))
+            if not low - slack <= worst <= high + slack:
+                lines.append(f"{name} = {worst:.4g}, but trained on {low:.4g} to {high:.4g}")
+        return lines
+
+
+def _extent(scene: Scene) -> dict[str, list[float]]:
+    gravity = math.hypot(*scene.gravity)
+    extent = {
+        "max_speed": [math.hypot(*r.velocity) for r in scene.releases],
+        "release_height": [r.upper[1] - scene.base for r in scene.releases],
+        "gravity": [gravity],
+        "friction_angle": [scene.material.friction_angle],
+        "cohesion": [scene.material.cohesion],
+        "base_friction": [scene.friction.base],
+        "wall_friction": [scene.friction.walls],
+    }
+    if gravity > 0:
+        cosine = min(1.0, max(-1.0, -scene.gravity[1] / gravity))
+        extent["slope"] = [math.degrees(math.acos(cosine))]
+    if scene.baffles:
+        extent["baffle_friction"] = [scene.friction.baffles]
+        extent["baffle_height"] = [b.size[1] for b in scene.baffles]
+        extent["baffle_width"] = [s for b in scene.baffles for s in (b.size[0], *b.size[2:])]
+    return extent
+
+
+class ModelConfig(BaseModel):
+    """Architecture, resolution and stride of a graph network simulator.
+
+    The defaults are `baffle-lite`'s; `ModelConfig.paper(dim)` is the network of Choi & Kumar.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    dim: Literal[2, 3] = 3
+    spacing: Positive = 0.03125  #: of the points that it moves [m]
+    dt: Positive = 0.0125  #: stride of one step [s]
+    radius: Positive = 0.05  #: points closer than this are joined by an edge [m]
+    history: Annotated[int, Field(ge=1)] = 3  #: number of past velocities that it sees
+
+    latent: Annotated[int, Field(ge=1)] = 64
+    hidden_layers: Annotated[int, Field(ge=1)] = 2  #: of every MLP
+    blocks: Annotated[int, Field(ge=1)] = 5  #: message-passing blocks, own weights each
+    activation: Literal["silu", "relu"] = "silu"
+    #: Multiply messages by a smooth function of distance that vanishes at `radius`.
+    envelope: bool = True
+    #: Give edges the relative velocity beside the displacement.
+    relative_velocity: bool = True
+
+    #: Predict a - g, so that free flight comes free.
+    subtract_gravity: bool = True
+    #: "fade": smooth, vanishes at `wall_range`. "clip": the paper's distance / radius in [-1, 1].
+    walls: Literal["fade", "clip"] = "fade"
+    wall_range: Positive = 0.05  #: [m]
+    #: "distance": signed distance and normal to the exact boxes. "points": the paper's kinematic
+    #: points, which need `types`.
+    baffles: Literal["distance", "points"] = "distance"
+    baffle_range: Positive = 0.1  #: where the influence of a baffle on the features ends [m]
+    #: Push points out of the boxes and into the domain after every step.
+    project: bool = True
+
+    types: Annotated[int, Field(ge=0)] = 0  #: number of particle types to embed; 0: none
+    type_embedding: Annotated[int, Field(ge=1)] = 16
+    #: Properties of the scene that every vertex sees, in this order.
+    material_features: tuple[Literal["tan_friction_angle", "base_friction"], ...] = ()
+
+    noise_std: NonNegative = 3e-4  #: of the random walk on the input positions in training [m]
+    limits: Limits = Limits()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> ModelConfig:
+        if self.baffles == "points" and self.types == 0:
+            raise ValueError('baffles = "points" needs types > 0 to tell them from moving points')
+        if self.radius <= self.spacing:
+            raise ValueError(
+                f"radius {self.radius:g} m must exceed the spacing {self.spacing:g} m, "
+                "or no two points are joined"
+            )
+        return self
+
+    @property
+    def vertex_inputs(self) -> int:
+        """Width of the vertex features, without the type embedding."""
+        width = self.history * self.dim + 2 * self.dim + len(self.material_features)
+        return width + (self.dim + 2 if self.baffles == "distance" else 0)
+
+    @property
+    def edge_inputs(self) -> int:
+        """Width of the edge features."""
+        return self.dim + 1 + (self.dim if self.relative_velocity else 0)
+
+    @classmethod
+    def paper(cls, dim: Literal[2, 3] = 2) -> ModelConfig:
+        """The GNS of Choi & Kumar: 1,591,826 parameters in 2D and 1,592,979 in 3D."""
+        return cls(
+            dim=dim,
+            spacing=0.00625 if dim == 2 else 0.015625,
+            dt=0.0025,
+            radius=0.030 if dim == 2 else 0.025,
+            history=5,
+            latent=128,
+            blocks=10,
+            activation="relu",
+            envelope=False,
+            relative_velocity=False,
+            subtract_gravity=False,
+            walls="clip",
+            baffles="points",
+            project=False,
+            types=PAPER_TYPES,
+            noise_std=6.7e-4,
+        )

@@ -1,0 +1,185 @@
+"""What surrounds the points of a batch: domains, gravity, baffles and material of its scenes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from gns_model.particles import MOVING, STATIONARY
+from gns_model.scene import Scene
+
+#: A face this close to a domain wall counts as flush with it: no point passes there [m].
+FLUSH = 1e-6
+
+#: Where boxes that fill up a ragged batch stand [m]: beyond every range, and finite.
+_FAR = 1e6
+
+#: Columns of `World.material`.
+MATERIAL_FEATURES = ("tan_friction_angle", "base_friction")
+
+
+@dataclass(frozen=True)
+class World:
+    """The surroundings of N points in S scenes with K baffles altogether.
+
+    Attributes:
+        batch: scene of every point, int64, shape (N,).
+        lower, upper: corners of the domains [m], shape (S, D).
+        gravity: [m/s²], shape (S, D).
+        boxes: lower and upper corner of every baffle [m], shape (K, 2, D); may require grad.
+        box_batch: scene of every baffle, int64, shape (K,).
+        material: tan of the friction angle and base friction [-], shape (S, 2).
+        particle_type: shape (N,); 6 moves, 3 is a kinematic point of a baffle.
+        point_boxes: the baffles that each point may meet [m], shape (N, M, 2, D), M the most of
+            any scene. Faces flush with the domain reach far beyond it: what is not a way out for
+            a grain is not near for it either. Scenes with fewer have the rest far away.
+    """
+
+    batch: Tensor
+    lower: Tensor
+    upper: Tensor
+    gravity: Tensor
+    boxes: Tensor
+    box_batch: Tensor
+    material: Tensor
+    particle_type: Tensor
+    point_boxes: Tensor = field(init=False)
+    point_lower: Tensor = field(init=False)
+    point_upper: Tensor = field(init=False)
+    point_gravity: Tensor = field(init=False)
+
+    def __post_init__(self) -> None:
+        put = object.__setattr__  # the class is frozen; these follow from the other fields
+        put(self, "point_boxes", self._scene_boxes()[self.batch])
+        put(self, "point_lower", self.lower[self.batch])
+        put(self, "point_upper", self.upper[self.batch])
+        put(self, "point_gravity", self.gravity[self.batch])
+
+    def _scene_boxes(self) -> Tensor:
+        """Boxes by scene with flush faces extended, shape (S, M, 2, D)."""
+        scenes, dim = self.lower.shape
+        if len(self.boxes) == 0:
+            return self.boxes.new_zeros((scenes, 0, 2, dim))
+        low, high = self.boxes[:, 0], self.boxes[:, 1]
+        low = torch.where(low - self.lower[self.box_batch] < FLUSH, low - _FAR, low)
+        high = torch.where(self.upper[self.box_batch] - high < FLUSH, high + _FAR, high)
+        count = torch.bincount(self.box_batch, minlength=scenes)
+        order = self.box_batch.argsort(stable=True)
+        first = count.cumsum(0) - count
+        slot = torch.empty_like(order)
+        slot[order] = torch.arange(len(order), device=order.device) - first[self.box_batch[order]]
+        far = self.boxes.new_full((scenes, int(count.max()), 2, dim), _FAR)
+        return far.index_put((self.box_batch, slot), torch.stack([low, high], dim=1))
+
+    @property
+    def moving(self) -> Tensor:
+        """Mask of the points that the simulator moves, shape (N,)."""
+        return self.particle_type != STATIONARY
+
+    @classmethod
+    def from_scenes(
+        cls,
+        scenes: Sequence[Scene],
+        counts: Sequence[int],
+        *,
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float32,
+        centres: Sequence[Tensor] | None = None,
+        particle_type: Tensor | None = None,
+    ) -> World:
+        """The world of a block-diagonal batch.
+
+        Args:
+            scenes: S scenes of one dimension.
+            counts: number of points of each, in the order in which the batch holds them.
+            centres: replaces the plan centres [m] of the baffles, one tensor (B, D-1) a scene;
+                everything that is computed in this world is then differentiable in them.
+            particle_type: shape (N,); default: all points move.
+        """
+        if centres is not None and len(centres) != len(scenes):
+            raise ValueError(f"{len(scenes)} scenes, but centres for {len(centres)}")
+
+        def tensor(values: object) -> Tensor:
+            return torch.tensor(values, dtype=dtype, device=device)
+
+        boxes = []
+        for k, scene in enumerate(scenes):
+            own = centres[k] if centres is not None else None
+            boxes.append(baffle_boxes(scene, own, device=device, dtype=dtype))
+        number = torch.tensor([len(b) for b in boxes], device=device)
+        per_point = torch.tensor(list(counts), device=device)
+        index = torch.arange(len(scenes), device=device)
+        batch = torch.repeat_interleave(index, per_point)
+        if particle_type is None:
+            particle_type = torch.full_like(batch, MOVING)
+        return cls(
+            batch=batch,
+            lower=tensor([s.domain.lower for s in scenes]),
+            upper=tensor([s.domain.upper for s in scenes]),
+            gravity=tensor([s.gravity for s in scenes]),
+            boxes=torch.cat(boxes),
+            box_batch=torch.repeat_interleave(index, number),
+            material=tensor(
+                [
+                    [math.tan(math.radians(s.material.friction_angle)), s.friction.base]
+                    for s in scenes
+                ]
+            ),
+            particle_type=particle_type,
+        )
+
+
+def baffle_boxes(
+    scene: Scene,
+    centres: Tensor | None = None,
+    *,
+    device: torch.device | str = "cpu",
+    dtype: torch.dtype = torch.float32,
+) -> Tensor:
+    """Corners of the baffles of `scene` [m], shape (B, 2, D), differentiable in `centres` (B, D-1).
+
+    Raises:
+        ValueError: if `centres` is not one plan centre for every baffle of the scene.
+    """
+    shape = (len(scene.baffles), scene.dim - 1)
+    if centres is None:
+        return torch.tensor(scene.baffle_boxes(), dtype=dtype, device=device)
+    if tuple(centres.shape) != shape:
+        raise ValueError(f"centres must have shape {shape}, got {tuple(centres.shape)}")
+    if not scene.baffles:
+        return torch.zeros((0, 2, scene.dim), dtype=dtype, device=device)
+    centres = centres.to(device=device, dtype=dtype)
+    size = torch.tensor([b.size for b in scene.baffles], dtype=dtype, device=device)
+    base = torch.full_like(centres[:, :1], scene.base)
+    half = torch.cat([size[:, :1], size[:, 2:]], dim=1) / 2
+    low, high = centres - half, centres + half
+    return torch.stack(
+        [
+            torch.cat([low[:, :1], base, low[:, 1:]], dim=1),
+            torch.cat([high[:, :1], base + size[:, 1:2], high[:, 1:]], dim=1),
+        ],
+        dim=1,
+    )
+
+
+def baffle_points(boxes: Tensor, spacing: float) -> Tensor:
+    """The paper's kinematic points: boxes filled with a lattice about `spacing` [m] apart.
+
+    Args:
+        boxes: lower and upper corners [m], shape (B, 2, D); may require grad.
+
+    Returns:
+        positions [m], shape (P, D), differentiable in the boxes.
+    """
+    points = []
+    for low, high in boxes:
+        size = high - low
+        counts = [max(1, round(float(s) / spacing)) for s in size.detach()]
+        axes = [(torch.arange(n, device=boxes.device, dtype=boxes.dtype) + 0.5) / n for n in counts]
+        unit = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, len(counts))
+        points.append(low + unit * size)
+    return torch.cat(points) if points else boxes.new_zeros((0, boxes.shape[-1]))

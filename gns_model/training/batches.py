@@ -1,0 +1,128 @@
+"""Which windows a step trains on, and how they become one block-diagonal batch.
+
+All chance in training comes from generators seeded with (seed, purpose, step, rank): the position
+of the sampler is the number of the step, and a resumed run draws what it would have drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gns_model.data.windows import Window, WindowIndex
+from gns_model.learned.world import World
+from gns_model.training.augment import mirror_positions, mirrored
+from gns_model.training.noise import random_walk
+from gns_model.training.statistics import Statistics
+
+#: Purposes of random generators.
+DRAW, NOISE, UNROLL = 1, 2, 3
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One window to read."""
+
+    source: int
+    frame: int
+    residue: int
+    mirror: bool
+    edges: float  #: that it will have, about
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Windows side by side.
+
+    Attributes:
+        history: noisy positions [m], oldest first, shape (N, H+1, D).
+        moves: true displacement of each coming step [m], shape (N, K, D).
+        world: what surrounds the points.
+    """
+
+    history: Tensor
+    moves: Tensor
+    world: World
+
+
+def generator(seed: int, purpose: int, step: int, rank: int = 0) -> np.random.Generator:
+    """The random generator of one purpose in one step on one rank."""
+    return np.random.default_rng([seed, purpose, step, rank])
+
+
+def draw(
+    index: WindowIndex,
+    rng: np.random.Generator,
+    *,
+    ranks: int,
+    edges_per_batch: int,
+    statistics: Statistics,
+    mirror: bool,
+    unroll: int = 1,
+) -> list[list[Draw]]:
+    """The windows of one step for every rank, so that all have about `edges_per_batch` edges.
+
+    Trajectories, frames and tracer sets are drawn uniformly. Every rank calls this with the same
+    generator and takes its own part. The largest windows are dealt first, each to the rank that
+    has the least, so that no rank waits long for another.
+    """
+    draws: list[Draw] = []
+    total = 0.0
+    while True:
+        source = int(rng.integers(len(index.sources)))
+        starts = index.starts(source, unroll)
+        frame = int(rng.integers(starts))
+        residue = int(rng.integers(index.residues(source)))
+        flip = bool(rng.integers(2)) and mirror
+        points = index.sources[source].points(residue)
+        edges = statistics.edges(points, (frame + 0.5) / starts)
+        if len(draws) >= ranks and total + edges / 2 > ranks * edges_per_batch:
+            break
+        draws.append(Draw(source, frame, residue, flip, edges))
+        total += edges
+    parts: list[list[Draw]] = [[] for _ in range(ranks)]
+    for item in sorted(draws, key=lambda d: -d.edges):
+        min(parts, key=lambda part: sum(d.edges for d in part)).append(item)
+    return parts
+
+
+def read(index: WindowIndex, item: Draw, *, unroll: int = 1) -> Window:
+    """Read what was drawn, mirrored if so drawn."""
+    window = index.read(item.source, item.frame, item.residue, unroll=unroll)
+    if not item.mirror:
+        return window
+    return Window(
+        mirror_positions(window.history, window.scene),
+        mirror_positions(window.future, window.scene),
+        mirrored(window.scene),
+    )
+
+
+def collate(
+    windows: Sequence[Window],
+    *,
+    noise_std: float,
+    rng: np.random.Generator,
+    device: torch.device,
+) -> Batch:
+    """Lay windows side by side and add random-walk noise to the history.
+
+    The true displacements are taken between true positions, so that adding one to a noisy position
+    corrects the target for the noise: a step that reproduces it ends with the true velocity.
+    """
+    history = np.concatenate([w.history for w in windows])
+    future = np.concatenate([w.future for w in windows])
+    moves = np.diff(future, axis=1, prepend=history[:, -1:])
+    if noise_std > 0:
+        points, frames, dim = history.shape
+        history = history + random_walk(rng, points, frames - 1, dim, noise_std)
+    world = World.from_scenes(
+        [w.scene for w in windows], [len(w.history) for w in windows], device=device
+    )
+    return Batch(
+        torch.from_numpy(history).to(device), torch.from_numpy(moves).to(device), world
+    )

@@ -1,0 +1,54 @@
+"""The training loss: error of the acceleration after contact, over one step or several.
+
+A step of the model includes the projection out of baffles and walls, so the loss looks at where
+points end, never at what the network said before: what contact corrects costs nothing.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gns_model.learned.model import LearnedModel
+from gns_model.training.batches import Batch
+
+
+def step_error(model: LearnedModel, history: Tensor, after: Tensor, move: Tensor) -> Tensor:
+    """Mean square of the normalised acceleration error, a scalar.
+
+    ((p' - p) - move)² / dt⁴ / acc_std², averaged over points and axes. With p the noisy position
+    and `move` the true displacement, this is the squared error of normalised acceleration against
+    the target corrected for noise (Sanchez-Gonzalez et al. 2020; Choi & Kumar).
+
+    Args:
+        history: shape (N, H+1, D); p is its last frame.
+        after: p', predicted [m], shape (N, D).
+        move: true displacement [m], shape (N, D).
+    """
+    error = (after - history[:, -1]) - move
+    return (error / (model.config.dt**2 * model.acceleration_std)).square().mean()
+
+
+def unrolled_loss(model: LearnedModel, batch: Batch, *, steps: int, backprop: bool) -> Tensor:
+    """Loss after the model has taken `steps` steps on its own, a scalar.
+
+    Args:
+        steps: 1 is plain one-step training; at most the K of the batch.
+        backprop: mean of all steps' errors with gradients through all of them. Otherwise
+            push-forward (Brandstetter et al. 2022): the first steps only prepare an input with
+            the model's own error, and the last one is the loss.
+    """
+    history = batch.history
+    if not backprop:
+        with torch.no_grad():
+            for _ in range(steps - 1):
+                after = model.step(history, batch.world)
+                history = torch.cat([history[:, 1:], after[:, None]], dim=1)
+        after = model.step(history, batch.world)
+        return step_error(model, history, after, batch.moves[:, steps - 1])
+    total = batch.moves.new_zeros(())
+    for k in range(steps):
+        after = model.step(history, batch.world)
+        total = total + step_error(model, history, after, batch.moves[:, k])
+        history = torch.cat([history[:, 1:], after[:, None]], dim=1)
+    return total / steps

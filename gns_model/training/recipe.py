@@ -1,0 +1,121 @@
+"""A recipe: everything that decides what a training run makes, in one small TOML file."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from gns_model.errors import GnsError
+from gns_model.learned.config import ModelConfig
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1)]
+
+
+class RecipeError(GnsError, ValueError):
+    """A recipe that cannot be trained: the message names the key, the value and what is allowed."""
+
+
+class Recipe(BaseModel):
+    """What to train, on what, for how long. Frozen; unknown keys are refused.
+
+    The folders are relative to the directory that training is started in.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    name: str = "model"
+    #: Architecture and resolution. Its `noise_std` is the noise of the training, too; its
+    #: `limits` are filled in from the training scenes.
+    model: ModelConfig = ModelConfig()
+
+    train: tuple[str, ...] = Field(min_length=1)  #: folders of trajectory files
+    valid: tuple[str, ...] = ()  #: folders of held-out ones; without any, the last model is kept
+    valid_rollouts: Count = 8  #: trajectories that a validation simulates, spread over the ranks
+    valid_windows: Count = 32  #: windows of the one-step validation loss
+
+    steps: Count | None = None  #: optimiser steps, or ...
+    minutes: Positive | None = None  #: ... time to spend, earlier runs that it resumes included
+    edges_per_batch: Count = 60_000  #: of one rank; a batch holds at least one window
+    learning_rate: Positive = 2e-3
+    #: "cosine": warm-up, then to zero at the end of the budget. "exponential": the paper's,
+    #: tenfold lower every `decay_steps`.
+    schedule: Literal["cosine", "exponential"] = "cosine"
+    warmup: Fraction = 0.02  #: of the budget
+    decay_steps: Count = 5_000_000
+    weight_decay: NonNegative = 1e-4
+    clip_norm: Positive = 1.0  #: of the whole gradient
+    ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.999
+    mirror: bool = True  #: show every other window in a mirror across z; 3D only
+    statistics_windows: Count = 256  #: windows that the normalisation is measured on
+
+    unroll: Count = 1  #: steps K of the unrolled phase
+    unroll_fraction: Fraction = 0.0  #: last part of the budget that is unrolled
+    #: Let gradients flow through all K steps; else only through each step's own (push-forward).
+    backprop_through_unroll: bool = False
+
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    precision: Literal["float32", "bfloat16"] = "float32"  #: of matrix products
+    threads: Count = 1  #: of every CPU rank
+    seed: Annotated[int, Field(ge=0)] = 0
+    checkpoint_minutes: Positive = 5.0
+    validate_minutes: Positive = 15.0
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Recipe:
+        if (self.steps is None) == (self.minutes is None):
+            raise ValueError("give either steps or minutes, one of the two")
+        if self.mirror and self.model.dim != 3:
+            raise ValueError("mirror = true needs a 3D model; set mirror = false")
+        if self.model.baffles == "points":
+            raise ValueError('model.baffles = "points" is for imported weights, not for training')
+        if self.model.types:
+            raise ValueError("model.types = 0 is the only choice for training: all points move")
+        return self
+
+    @classmethod
+    def from_toml(cls, path: str | os.PathLike[str]) -> Recipe:
+        """Read a recipe.
+
+        Raises:
+            RecipeError: if it is missing, is not TOML or is not a recipe; one line.
+        """
+        path = Path(path)
+        try:
+            values = tomllib.loads(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise RecipeError(f"{path}: cannot be read ({error.strerror})") from None
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise RecipeError(f"{path}: not a TOML file ({error})") from None
+        return cls.from_dict(values, source=str(path))
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any], source: str = "recipe") -> Recipe:
+        """A recipe from plain values.
+
+        Raises:
+            RecipeError: one line that names the key, the value and what is allowed.
+        """
+        try:
+            return cls.model_validate(values)
+        except ValidationError as error:
+            raise RecipeError(f"{source}: {_first_fault(error)}") from None
+
+
+def _first_fault(error: ValidationError) -> str:
+    fault = error.errors()[0]
+    key = ".".join(str(part) for part in fault["loc"])
+    message = fault["msg"].removeprefix("Value error, ")
+    if fault["type"] == "extra_forbidden":
+        return f"unknown key {key!r} (value {fault['input']!r})"
+    if fault["type"] == "missing":
+        return f"key {key!r} is missing"
+    if fault["type"] == "value_error":
+        return f"{key}: {message}" if key else message
+    return f"{key} = {fault['input']!r}: {message}"
