@@ -113,7 +113,7 @@ def _top(flows: list[tuple[Design, Trajectory]], to_map) -> float:
     seen = [
         to_map(flow, frame).values.ravel()
         for _, flow in flows
-        for frame in np.linspace(0, len(flow.time) - 1, 5).astype(int)
+        for frame in (np.linspace(0.3, 1, 4) * (len(flow.time) - 1)).astype(int)
     ]
     values = np.concatenate(seen)
     return float(np.quantile(values[values > views.LEAST_SHOWN], 0.985))
@@ -122,7 +122,9 @@ def _top(flows: list[tuple[Design, Trajectory]], to_map) -> float:
 def _gif(pictures: list[Image.Image]) -> bytes:
     """One palette for all frames: without it colours flicker and nothing between frames is equal."""
     chosen = [np.asarray(pictures[int(k * (len(pictures) - 1))]) for k in (0.2, 0.5, 1.0)]
-    palette = Image.fromarray(np.concatenate(chosen)).quantize(112, dither=Image.Dither.NONE)
+    palette = Image.fromarray(np.concatenate(chosen)).quantize(
+        128, kmeans=1, dither=Image.Dither.NONE
+    )
     frames = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
     durations = [FRAME_MS] * (len(frames) - 1) + [HOLD_MS]
     content = io.BytesIO()

@@ -26,8 +26,8 @@ from gns_model.trajectory import Trajectory
 #: Width of a full figure [inch]; at DPI it is sharp on a page about 1080 CSS pixels wide.
 WIDTH, DPI = 10.4, 170
 
-#: Shares of the time until the flow rests at which it is shown.
-INSTANTS = (0.18, 0.45, 0.7, 1.0)
+#: Shares of the time until the flow rests at which it is shown, before the end.
+INSTANTS = (0.3, 0.6, 0.9)
 
 #: Measures in which the two simulators are compared, as the brief of the surrogate names them.
 COMPARED = ("centroid_travel", "runout_p99", "upstream_depth", "mass_past_section")
@@ -80,15 +80,16 @@ def _over_time(run, theme, to_map, draw, ylabel, quantity, least_dim) -> Figure 
     scene = rows[0][1].scene
     side = to_map is views.side_map
     height = (views.side_top(scene) - scene.base) if side else scene.domain.size[-1]
-    panel = (WIDTH - 1.35) / len(INSTANTS)
+    panel = (WIDTH - 1.35) / (len(INSTANTS) + 1)
     row = panel * height / scene.domain.size[0]
     figure = Figure(figsize=(WIDTH, len(rows) * (row + 0.27) + 0.4), layout="constrained")
     figure.get_layout_engine().set(w_pad=0.03, h_pad=0.05, wspace=0.01, hspace=0.02)
-    grid = figure.subplots(len(rows), len(INSTANTS), squeeze=False, sharex=True, sharey=True)
+    grid = figure.subplots(len(rows), len(INSTANTS) + 1, squeeze=False, sharex=True, sharey=True)
     times = _instants(rows[0][1])
     maps = [[to_map(flow, views.frame_at(flow, t)) for t in times] for _, flow in rows]
-    everything = np.concatenate([m.values.ravel() for line in maps for m in line])
-    top = float(np.quantile(everything[everything > views.LEAST_SHOWN], 0.985))
+    # The block as released is deeper than all that follows: let it saturate.
+    everything = np.concatenate([m.values.ravel() for line in maps for m in line[1:]])
+    top = float(np.quantile(everything[everything > views.LEAST_SHOWN], 0.99))
     for r, (design, flow) in enumerate(rows):
         colour = layout_colour(theme, design.key)
         for c, t in enumerate(times):
@@ -100,7 +101,8 @@ def _over_time(run, theme, to_map, draw, ylabel, quantity, least_dim) -> Figure 
             if r == len(rows) - 1:
                 axes.set_xlabel("x [m]")
         grid[r, 0].set_ylabel(ylabel)
-    bar = figure.colorbar(image, ax=grid, aspect=38 if len(rows) > 1 else 20, pad=0.012, shrink=0.9)
+    bar = figure.colorbar(image, ax=grid, aspect=38 if len(rows) > 1 else 20,
+                          pad=0.012, shrink=0.9, extend="max")
     bar.set_label(quantity)
     bar.outline.set_visible(False)
     return figure
@@ -129,7 +131,7 @@ def _instants(flow: Trajectory) -> list[float]:
     x = views.moving_positions(flow)[:, :, 0].mean(axis=1)
     travelled = (x - x[0]) / max(float(x[-1] - x[0]), 1e-9)
     rest = float(flow.time[min(int(np.searchsorted(travelled, 0.985)), len(x) - 1)])
-    return [share * rest for share in INSTANTS[:-1]] + [float(flow.time[-1])]
+    return [share * rest for share in INSTANTS] + [float(flow.time[-1])]
 
 
 # -- the search ------------------------------------------------------------------------------------
@@ -316,7 +318,7 @@ def _profiles(axes: Axes, solver: Trajectory, learned: Trajectory, theme: Theme)
 
 
 def _pair(solver, learned, theme):
-    return ((solver, theme.sand[3], "-", 1.8), (learned, theme.best, (0, (4, 1.6)), 1.5))
+    return ((solver, theme.sand[3], "-", 1.8), (learned, theme.origins[1], (0, (4, 1.6)), 1.5))
 
 
 # -- helpers ---------------------------------------------------------------------------------------

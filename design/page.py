@@ -31,13 +31,17 @@ section{margin-top:52px}
 section>p:first-of-type{margin-bottom:18px}
 .card{background:var(--paper);border:1px solid var(--line);border-radius:12px;padding:22px 24px}
 .answer{display:grid;grid-template-columns:minmax(0,1.22fr) minmax(0,1fr);gap:28px;margin-top:28px}
-.tiles{display:grid;grid-template-columns:repeat(auto-fit,minmax(210px,1fr));gap:14px;
- margin:0 0 16px}
+.stack{display:flex;flex-direction:column;gap:16px}
+.tiles{display:grid;grid-template-columns:1fr 1fr;gap:16px;flex:1}
 .tile{background:var(--paper);border:1px solid var(--line);border-radius:12px;padding:16px 18px}
-.tile b{display:block;font-size:29px;letter-spacing:-.025em;line-height:1.15;font-weight:650;
+.tile b{display:block;font-size:27px;letter-spacing:-.025em;line-height:1.15;font-weight:650;
  margin:3px 0 9px;font-variant-numeric:tabular-nums}
 .tile b i{font-style:normal;font-size:16px;color:var(--muted);font-weight:500;letter-spacing:0}
-.tile span{display:block;font-size:13.5px}
+.tile>span{display:block;font-size:13.5px;line-height:1.45}
+.tile em{font-style:normal;color:var(--muted)}
+.change small{display:inline;color:inherit;font-weight:500}
+.fine{color:var(--muted);font-size:13.5px;margin:14px 0 0}
+.nowrap{white-space:nowrap}
 table{border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums;font-size:14.5px}
 th{font-weight:550;color:var(--muted);font-size:13px;text-align:right;padding:0 0 8px 18px;
  vertical-align:bottom;line-height:1.3}

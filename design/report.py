@@ -94,7 +94,8 @@ def _answer(run: RunResults, name: str) -> str:
         drawing = layout_drawing(run.scene, placed, own)
         parts.append(
             f'<div class="answer"><div class="card">{drawing}{_legend(run.scene)}</div>'
-            f'<div class="card"><h3>Where the baffles go</h3>{_coordinates(placed)}</div></div>'
+            f'<div class="stack"><div class="card"><h3>Where the baffles go</h3>'
+            f"{_coordinates(placed)}</div>{_tiles(run, best)}</div></div>"
         )
     return "".join(parts)
 
@@ -123,10 +124,10 @@ def _headline(run: RunResults, best: Design, count: int) -> tuple[str, str]:
     """The answer as a title and two or three sentences; claims only what was measured."""
     verified = bool(best.verified)
     values = best.verified or best.surrogate
-    baffles = f"{count} baffle{'s' if count != 1 else ''}"
+    baffles = wording.count(count, "baffle")
     travel = values.get("centroid_travel")
     if travel is None:
-        return f"{baffles.capitalize()}, judged by nobody yet", "No measures of it were written."
+        return f"{baffles}, judged by nobody yet", "No measures of it were written."
     quantity = {q.name: q for q in wording.quantities(run.scene)}
     own, none = run.design("paper"), run.design("none")
     against = {
@@ -138,12 +139,12 @@ def _headline(run: RunResults, best: Design, count: int) -> tuple[str, str]:
     by = "On the reference solver" if verified else "By the learned simulator alone"
     if verified and own is not None and _judgement(best, own) in ("worse", "same"):
         title = "The search found nothing better than the scene's own layout"
-    elif from_none is not None and from_none < -wording.NEGLIGIBLE:
-        title = f"{baffles.capitalize()} that stop the flow {abs(100 * from_none):.1f} % shorter"
+    elif from_none is not None and wording.verdict(from_none, -1) == "better":
+        title = f"{baffles} that stop the flow {_share(from_none)} shorter"
     elif from_none is not None:
-        title = f"{baffles.capitalize()} do not shorten this flow"
+        title = f"{baffles} that do not shorten this flow"
     else:
-        title = f"Where to put {baffles}"
+        title = f"Where to put {baffles.lower()}"
     sentences = [
         f"{by}, the centre of mass moves {quantity['centroid_travel'].text(travel)} with this "
         f"layout{_against(from_none, 'without baffles')}"
@@ -155,7 +156,7 @@ def _headline(run: RunResults, best: Design, count: int) -> tuple[str, str]:
         gain = wording.change(depth, reference.get("upstream_depth"))
         sentences.append(
             f"The flow gets up to {quantity['upstream_depth'].text(depth)} deep before a baffle"
-            f"{_against(gain, 'with the scene’s own layout')}."
+            f"{_against(gain, 'with the scene’s own layout', name='upstream_depth')}."
         )
     if not verified and not best.status:
         sentences.append(
@@ -170,13 +171,19 @@ def _headline(run: RunResults, best: Design, count: int) -> tuple[str, str]:
     return escape(title), " ".join(sentences)
 
 
-def _against(share: float | None, what: str, *, second: bool = False) -> str:
+def _against(
+    share: float | None, what: str, *, second: bool = False, name: str = "centroid_travel"
+) -> str:
     if share is None:
         return ""
     joint = " and " if second else ": "
-    if abs(share) < wording.NEGLIGIBLE:
+    if wording.negligible(share, name):
         return f"{joint}as much as {what}"
-    return f"{joint}{abs(100 * share):.1f} % {'less' if share < 0 else 'more'} than {what}"
+    return f"{joint}{_share(share)} {'less' if share < 0 else 'more'} than {what}"
+
+
+def _share(share: float) -> str:
+    return f"{abs(100 * share):.1f}{wording.NBSP}%"
 
 
 def _judgement(design: Design, other: Design | None) -> str:
@@ -205,7 +212,7 @@ def _coordinates(placed: Scene) -> str:
     gaps = _least_gap(placed)
     clear = f"<br>Least clear distance between two: {gaps:.3f} m." if gaps is not None else ""
     return (
-        f"{page.table(head, rows)}<p class=muted style='margin:16px 0 0;font-size:13.5px'>"
+        f"{page.table(head, rows)}<p class='fine'>"
         f"Each {text}. Volume in all {volume:.4g} {unit}.{clear}<br>As files: layouts/best.toml, "
         "best.stl, best.glb.</p>"
     )
@@ -270,30 +277,18 @@ def _gains(run: RunResults) -> str:
         return ""
     verified = bool(best.verified)
 
-    def values(design: Design | None) -> dict[str, float]:
-        return {} if design is None else (design.verified if verified else design.surrogate)
-
-    others = [d for d in (run.design("none"), run.design("paper")) if d is not None and values(d)]
-    tiles, rows = [], []
+    others = _others(run, verified)
+    rows = []
     for q in wording.quantities(run.scene):
-        value = values(best).get(q.name)
+        value = _values(best, verified).get(q.name)
         if value is None:
             continue
-        changes = [(d, wording.change(value, values(d).get(q.name))) for d in others]
-        if q.name in HEADLINE:
-            lines = "".join(
-                f"<span>{_changed(share, q.sense)} <span class=muted style='display:inline'>"
-                f"{_versus(d)}</span></span>"
-                for d, share in changes
-            )
-            number = q.text(value, unit=False)
-            tiles.append(f'<div class="tile"><span class="muted">{escape(q.title)}</span>'
-                         f"<b>{number} <i>{escape(q.unit)}</i></b>{lines}</div>")
+        references = [_values(d, verified).get(q.name) for d in others]
         rows.append(
             [f'<span class="key">{escape(q.title)}</span><small>{escape(q.explanation)}</small>']
-            + [q.text(values(d).get(q.name)) for d in others]
+            + [q.text(reference) for reference in references]
             + [f"<b>{q.text(value)}</b>"]
-            + [_changed(share, q.sense) for _, share in changes]
+            + [_changed(wording.change(value, reference), q) for reference in references]
         )
     head = ["", *(escape(d.label) for d in others), '<i class="dot best"></i>Best found',
             *(f"against<br>{escape(d.label.lower())}" for d in others)]
@@ -306,20 +301,45 @@ def _gains(run: RunResults) -> str:
     cost = _cost_line(best, others, verified)
     return page.section(
         "What it gains",
-        f'<div class="tiles">{"".join(tiles)}</div><div class="card">{page.table(head, rows)}</div>',
-        intro=f"{by} {cost}",
+        f'<div class="card">{page.table(head, rows)}</div>',
+        intro=f"{by} {cost} “Same” means within what a jittered start changes by itself.",
     )
 
 
-def _changed(share: float | None, sense: int) -> str:
-    kind = wording.verdict(share, sense)
-    words = {"better": " better", "worse": " worse", "same": " same"}.get(kind, "")
-    return f'<span class="{kind or "same"}">{wording.percent(share)}<small style="display:inline">' \
-           f"{words}</small></span>"
+def _tiles(run: RunResults, best: Design) -> str:
+    """The four measures that decide, large, with their change."""
+    verified = bool(best.verified)
+    tiles = []
+    for q in wording.quantities(run.scene):
+        value = _values(best, verified).get(q.name)
+        if q.name not in HEADLINE or value is None:
+            continue
+        lines = "".join(
+            f"<span>{_changed(wording.change(value, _values(d, verified).get(q.name)), q)}"
+            f" <em>vs {'none' if d.key == 'none' else 'own'}</em></span>"
+            for d in _others(run, verified)
+        )
+        tiles.append(
+            f'<div class="tile"><span class="muted">{escape(q.title)}</span>'
+            f"<b>{q.text(value, unit=False)} <i>{escape(q.unit)}</i></b>{lines}</div>"
+        )
+    return f'<div class="tiles">{"".join(tiles)}</div>' if tiles else ""
 
 
-def _versus(design: Design) -> str:
-    return {"none": "against no baffles", "paper": "against the scene's own"}.get(design.key, "")
+def _values(design: Design, verified: bool) -> dict[str, float]:
+    return design.verified if verified else design.surrogate
+
+
+def _others(run: RunResults, verified: bool) -> list[Design]:
+    """What the best is compared with, by the same simulator."""
+    designs = (run.design("none"), run.design("paper"))
+    return [d for d in designs if d is not None and _values(d, verified)]
+
+
+def _changed(share: float | None, quantity: wording.Quantity) -> str:
+    kind = wording.verdict(share, quantity.sense, quantity.name)
+    word = f" <small>{kind}</small>" if kind else ""
+    return f'<span class="change {kind or "same"}">{wording.percent(share)}{word}</span>'
 
 
 def _cost_line(best: Design, others: list[Design], verified: bool) -> str:
@@ -389,7 +409,7 @@ def _trust(run: RunResults, pictures: dict[str, tuple[bytes, bytes]]) -> str:
             [
                 f'<span class="key">{escape(q.title)}</span>', q.text(of_best[0]),
                 q.text(of_best[1]), wording.percent(wording.change(*of_best)),
-                f"{100 * float(np.mean(gaps)):.1f} %", f"{100 * max(gaps):.1f} %",
+                _share(float(np.mean(gaps))), _share(max(gaps)),
                 "–" if rank is None else f"{rank:.2f}".replace("-", "−"),
             ]
         )
@@ -398,12 +418,13 @@ def _trust(run: RunResults, pictures: dict[str, tuple[bytes, bytes]]) -> str:
     head = ["", "best found,<br>learned", "best found,<br>solver", "gap", "mean |gap|",
             "largest |gap|", "rank<br>correlation"]
     count = len(compared)
+    names = ", ".join(d.label.lower() for d in compared)
     intro = (
-        f"The search looked through the learned simulator; {count} layout{'s' if count > 1 else ''} "
-        "(the best, the scene's own and no baffles among them where there) ran on both."
+        f"The search looked through the learned simulator. {wording.count(count, 'layout')} ran on "
+        f"the reference solver as well: {escape(names)}."
     )
     if worst is not None:
-        intro += f" It was off by {100 * worst[0]:.1f} % in centroid travel"
+        intro += f" It was off by {_share(worst[0])} in centroid travel"
         intro += (
             f" and put the layouts in order with a rank correlation of {worst[1]:.2f} (1 is the "
             "solver's order)."
@@ -442,10 +463,11 @@ def _choice(run: RunResults, pictures: dict[str, tuple[bytes, bytes]]) -> str:
             placed = run.scene.with_baffles(design.centres)
             values = design.verified or design.surrogate
             mark = "" if design.verified else " *"
-            centres = "  ".join(
-                "(" + ", ".join(f"{v:.3f}" for v in c) + ")" for c in design.centres
+            centres = " ".join(
+                f'<span class="nowrap">({", ".join(f"{v:.3f}" for v in c)})</span>'
+                for c in design.centres
             )
-            label = f'<span class="key">{escape(design.label)}</span><small>{escape(centres)}</small>'
+            label = f'<span class="key">{escape(design.label)}</span><small>{centres}</small>'
             rows.append(
                 [thumbnail(run.scene, placed, kind), label, escape(design.origin or "–"),
                  _cost(design.cost), "failed" if design.status not in ("", "ok") else
@@ -455,7 +477,7 @@ def _choice(run: RunResults, pictures: dict[str, tuple[bytes, bytes]]) -> str:
         head = ["", "", "from", "objective,<br>learned", "objective,<br>solver",
                 *(escape(_column(n)) for n in HEADLINE)]
         note = (
-            '<p class="muted" style="margin:12px 0 0;font-size:13px">* by the learned simulator: '
+            '<p class="fine">* by the learned simulator: '
             "not verified.</p>"
             if any(not d.verified for d in layouts)
             else ""

@@ -192,7 +192,6 @@ class Run:
 
     def publish(self) -> None:
         """Geometry, figures and report, from what stands in the run folder."""
-        from design.figures import write_figures
         from design.geometry import write_geometry
         from design.report import write_report
 
@@ -200,7 +199,6 @@ class Run:
             if self.ranked:
                 best = self.bare.with_baffles(self.ranked[0].centres)
                 write_geometry(best, self.out / "layouts", "best")
-            write_figures(self.out)
             write_report(self.out)
         self.write(complete=True)
 

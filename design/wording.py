@@ -6,8 +6,19 @@ from dataclasses import dataclass
 
 from gns_model.scene import Scene
 
-#: Relative changes below this are called no change: less than the solver's own repeatability.
-NEGLIGIBLE = 0.005
+#: Relative change that a jittered start brings about by itself, doubled: two runs that differ by
+#: less are called the same. From the signal-to-noise table of the reference solver's prototype.
+REPEATABILITY = {
+    "centroid_travel": 0.002,
+    "upstream_depth": 0.006,
+    "runout_p99": 0.02,
+    "mass_past_section": 0.06,
+}
+OTHERWISE = 0.01
+
+NBSP = "\u00a0"
+
+NUMERALS = ("No", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine")
 
 
 @dataclass(frozen=True)
@@ -28,7 +39,7 @@ class Quantity:
         if value is None:
             return "–"
         number = f"{value * self.factor:.{self.digits}f}".replace("-", "−")
-        return f"{number} {self.unit}" if unit else number
+        return f"{number}{NBSP}{self.unit}" if unit else number
 
 
 def quantities(scene: Scene | None) -> list[Quantity]:
@@ -47,8 +58,8 @@ def quantities(scene: Scene | None) -> list[Quantity]:
                  "Share of the mass beyond the control section at the end."),
         Quantity("overtopping", "Mass over a baffle's top", "%", 100, 2, -1,
                  "Share of the mass that crossed above the plan of a baffle at some time."),
-        Quantity("energy_dissipated", "Energy dissipated", energy, 1, 0, 1,
-                 "Potential and kinetic energy lost between start and end."),
+        Quantity("energy_dissipated", "Energy dissipated", energy, 1, 0, 0,
+                 "Potential and kinetic energy lost between start and end; mass held back high keeps some."),
         Quantity("runout_max", "Farthest grain", "m", 1, 3, 0,
                  "The paper's runout. Single grains decide it: reported, never optimised."),
     ]
@@ -65,16 +76,27 @@ def percent(share: float | None, digits: int = 1) -> str:
     """A signed share as per cent, with a true minus; an en dash where there is none."""
     if share is None:
         return "–"
-    return f"{100 * share:+.{digits}f} %".replace("-", "−")
+    return f"{100 * share:+.{digits}f}{NBSP}%".replace("-", "−")
 
 
-def verdict(share: float | None, sense: int) -> str:
-    """"better", "worse", "same", or "" where neither is meant."""
+def verdict(share: float | None, sense: int, name: str = "centroid_travel") -> str:
+    """"better", "worse", "same", or "" where neither is meant, of a change in a measure."""
     if share is None or sense == 0:
         return ""
-    if abs(share) < NEGLIGIBLE:
+    if negligible(share, name):
         return "same"
     return "better" if share * sense > 0 else "worse"
+
+
+def negligible(share: float, name: str = "centroid_travel") -> bool:
+    """Whether a relative change of a measure is within the repeatability of the solver."""
+    return abs(share) < REPEATABILITY.get(name, OTHERWISE)
+
+
+def count(number: int, noun: str) -> str:
+    """"Three baffles", "One baffle", "12 baffles"."""
+    numeral = NUMERALS[number] if number < len(NUMERALS) else str(number)
+    return f"{numeral} {noun}{'' if number == 1 else 's'}"
 
 
 def duration(seconds: float) -> str:

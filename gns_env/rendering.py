@@ -142,7 +142,7 @@ class SideView:
         # A grain is drawn about as large as it is, on the axes as they are when first shown.
         width = axes.get_window_extent().width / axes.figure.dpi
         grain = 72 * width / scene.domain.size[0] * trajectory.point_volume ** (1 / scene.dim)
-        self.points.set_sizes([min(max(0.6 * grain, 1.0), 6.0) ** 2])
+        self.points.set_sizes([min(max(0.5 * grain, 1.0), 6.0) ** 2])
 
     def show(self, frame: int) -> None:
         frame %= len(self.positions)

@@ -59,20 +59,22 @@ def main(app: Typer, name: str, arguments: list[str] | None = None) -> NoReturn:
     taken of what is half done.
     """
     from typer import Abort
-    from typer.exceptions import TyperException
 
     signal.signal(signal.SIGTERM, _interrupt)
     with clean_errors():
         try:
             code = app(arguments, prog_name=name, standalone_mode=False)
-        except TyperException as error:
+        except Abort:
+            raise KeyboardInterrupt from None
+        except Exception as error:
+            # click's and typer's usage errors, whose common base depends on typer's version.
+            if not hasattr(error, "format_message"):
+                raise
             message = error.format_message()
             if "\n" in message.strip():  # no command given: typer's message is the whole help
                 print(message, file=sys.stderr)
                 raise SystemExit(USER_ERROR) from None
             fail(f"{message} (see {name} --help)")
-        except Abort:
-            raise KeyboardInterrupt from None
         if code == INTERRUPTED:  # typer swallows the interrupt and returns its code
             raise KeyboardInterrupt
     raise SystemExit(code if isinstance(code, int) else 0)
@@ -107,3 +109,25 @@ def progress_bar(*, quiet: bool = False) -> Progress:
         console=Console(stderr=True),
         disable=quiet,
     )
+
+
+def print_table(title: str, columns: list[str], rows: list[list[str]]) -> None:
+    """Print a table on stdout, numbers to the right."""
+    from rich.table import Table
+
+    table = Table(*columns, title=title, title_justify="left")
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for row in rows:
+        table.add_row(*row)
+    show(table)
+
+
+def show(renderable: object) -> None:
+    """Print a rich renderable on stdout, as wide as it needs where stdout is not a terminal."""
+    from rich.console import Console
+
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=160)
+    console.print(renderable)

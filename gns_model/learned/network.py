@@ -7,6 +7,8 @@ import itertools
 import torch
 from torch import Tensor, nn
 
+from gns_model.learned.edge_kernel import edge_mlp
+
 ACTIVATIONS = {"silu": nn.functional.silu, "relu": nn.functional.relu}
 
 
@@ -25,10 +27,8 @@ class MLP(nn.Module):
     ) -> None:
         super().__init__()
         sizes = [inputs] + [latent] * hidden_layers + [outputs]
-        self.layers = nn.ModuleList(
-            nn.Linear(a, b) for a, b in itertools.pairwise(sizes)
-        )
-        self.activation = ACTIVATIONS[activation]
+        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(sizes))
+        self.activation = activation
         self.norm = nn.LayerNorm(outputs) if norm else None
 
     def forward(self, x: Tensor) -> Tensor:
@@ -38,18 +38,42 @@ class MLP(nn.Module):
     def after_first(self, h: Tensor) -> Tensor:
         """The rest, given the value of the first linear layer before its activation."""
         for layer in self.layers[1:]:
-            h = layer(self.activation(h))
+            h = layer(ACTIVATIONS[self.activation](h))
         return h if self.norm is None else self.norm(h)
 
-    def split_first(self, *widths: int) -> tuple[list[Tensor], Tensor]:
-        """Weights of the first layer for inputs that come in parts of these widths, and its bias.
+    def split_first(self, *widths: int) -> tuple[Tensor, ...]:
+        """Weights of the first layer for inputs that come in parts of these widths.
 
         W [a, b] = W_a a + W_b b: parts that live on vertices are multiplied once per vertex, and
         no wide concatenation is ever written.
         """
-        first = self.layers[0]
-        assert isinstance(first, nn.Linear)
-        return list(first.weight.split(widths, dim=1)), first.bias
+        return self.layers[0].weight.split(widths, dim=1)
+
+    def over_edges(
+        self,
+        edge: Tensor,
+        senders: Tensor,
+        receivers: Tensor,
+        dtype: torch.dtype,
+        first: Tensor,
+        vertex_terms: tuple[Tensor, Tensor] | None = None,
+        envelope: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """The MLP by `edge_mlp`, with `first` as the edge's part of the first weight."""
+        assert self.norm is not None
+        return edge_mlp(
+            edge,
+            vertex_terms,
+            envelope,
+            senders,
+            receivers,
+            first=first,
+            biases=[layer.bias for layer in self.layers],
+            weights=[layer.weight for layer in self.layers[1:]],
+            norm=(self.norm.weight, self.norm.bias),
+            activation=self.activation,
+            dtype=dtype,
+        )
 
 
 class Block(nn.Module):
@@ -72,24 +96,19 @@ class Block(nn.Module):
         senders: Tensor,
         receivers: Tensor,
         envelope: Tensor | None,
+        dtype: torch.dtype,
     ) -> tuple[Tensor, Tensor]:
-        """Vertex (N, L) and edge (E, L) latents; envelope (E, 1) or None."""
-        (w_receiver, w_sender, w_edge), bias = self.edge.split_first(*[self.latent] * 3)
-        hidden = nn.functional.linear(edge, w_edge)
-        hidden = hidden + nn.functional.linear(vertex, w_receiver, bias).index_select(0, receivers)
-        hidden = hidden + nn.functional.linear(vertex, w_sender).index_select(0, senders)
-        message = self.edge.after_first(hidden)
-        weighted = message if envelope is None else message * envelope
-        total = aggregate(weighted, receivers, len(vertex))
-        (w_vertex, w_total), bias = self.vertex.split_first(*[self.latent] * 2)
-        hidden = nn.functional.linear(vertex, w_vertex, bias)
+        """Vertex (N, L) and edge (E, L) latents; envelope (E, 1) or None; dtype of edge products."""
+        w_receiver, w_sender, w_edge = self.edge.split_first(*[self.latent] * 3)
+        at_receiver = nn.functional.linear(vertex, w_receiver)
+        at_sender = nn.functional.linear(vertex, w_sender)
+        edge, total = self.edge.over_edges(
+            edge, senders, receivers, dtype, w_edge, (at_receiver, at_sender), envelope
+        )
+        w_vertex, w_total = self.vertex.split_first(*[self.latent] * 2)
+        hidden = nn.functional.linear(vertex, w_vertex, self.vertex.layers[0].bias)
         hidden = hidden + nn.functional.linear(total, w_total)
-        return vertex + self.vertex.after_first(hidden), edge + message
-
-
-def aggregate(messages: Tensor, receivers: Tensor, vertices: int) -> Tensor:
-    """Sum of the messages (E, L) that each of `vertices` receives, shape (vertices, L)."""
-    return messages.new_zeros((vertices, messages.shape[1])).index_add(0, receivers, messages)
+        return vertex + self.vertex.after_first(hidden), edge
 
 
 class EncodeProcessDecode(nn.Module):
@@ -121,11 +140,18 @@ class EncodeProcessDecode(nn.Module):
         receivers: Tensor,
         envelope: Tensor | None = None,
     ) -> Tensor:
-        """(N, vertex_inputs), (E, edge_inputs), (E,), (E,), (E, 1) -> (N, outputs)."""
-        # Under autocast to bfloat16 the wide edge streams are short, while the few vertices keep
-        # their precision from block to block. (`index_select` has a faster backward than `[]`.)
-        vertex, edge = self.encode_vertex(vertex).to(vertex.dtype), self.encode_edge(edge)
-        for block in self.blocks:
-            vertex, edge = block(vertex, edge, senders, receivers, envelope)
-        with torch.autocast(vertex.device.type, enabled=False):
+        """(N, vertex_inputs), (E, edge_inputs), (E,), (E,), (E, 1) -> (N, outputs).
+
+        Under `torch.autocast` only the products over edges take its dtype: they are nearly all of
+        the work, while the few vertices keep their precision from block to block.
+        """
+        kind = vertex.device.type
+        short = torch.is_autocast_enabled(kind)
+        dtype = torch.get_autocast_dtype(kind) if short else edge.dtype
+        with torch.autocast(kind, enabled=False):
+            first = self.encode_edge.layers[0].weight
+            vertex = self.encode_vertex(vertex)
+            edge, _ = self.encode_edge.over_edges(edge, senders, receivers, dtype, first)
+            for block in self.blocks:
+                vertex, edge = block(vertex, edge, senders, receivers, envelope, dtype)
             return self.decode(vertex)

@@ -123,6 +123,4 @@ def collate(
     world = World.from_scenes(
         [w.scene for w in windows], [len(w.history) for w in windows], device=device
     )
-    return Batch(
-        torch.from_numpy(history).to(device), torch.from_numpy(moves).to(device), world
-    )
+    return Batch(torch.from_numpy(history).to(device), torch.from_numpy(moves).to(device), world)

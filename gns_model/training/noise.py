@@ -3,7 +3,7 @@
 Sanchez-Gonzalez et al. 2020, *Learning to simulate complex physics with graph networks*, section
 "Adding noise to the training inputs"; the same in geoelements/gns: velocity noise of standard
 deviation noise_std / sqrt(H) is drawn for every interval and cumulated, so that it reaches
-noise_std at the last velocity; position noise is the cumulated sum of that, zero in the first frame.
+noise_std at the last velocity; position noise is the cumulated sum of that, zero at first.
 """
 
 from __future__ import annotations

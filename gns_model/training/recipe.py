@@ -62,6 +62,7 @@ class Recipe(BaseModel):
 
     device: Literal["auto", "cpu", "cuda"] = "auto"
     precision: Literal["float32", "bfloat16"] = "float32"  #: of matrix products
+    compile: bool = False  #: the network by torch.compile; on a CPU it needs g++ and a minute
     threads: Count = 1  #: of every CPU rank
     seed: Annotated[int, Field(ge=0)] = 0
     checkpoint_minutes: Positive = 5.0

@@ -123,10 +123,10 @@ def _read(path: Path, *, tensors: bool) -> tuple[Position, dict[str, Tensor]]:
                 )
             values = json.loads(metadata["position"])
             content = {k: file.get_tensor(k) for k in file.keys()} if tensors else {}  # noqa: SIM118
-        statistics = {
+        measured: dict[str, Any] = {
             k: tuple(v) if isinstance(v, list) else v for k, v in values["statistics"].items()
         }
-        return Position(**{**values, "statistics": Statistics(**statistics)}), content
+        return Position(**{**values, "statistics": Statistics(**measured)}), content
     except FileFormatError:
         raise
     except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:

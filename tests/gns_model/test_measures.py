@@ -76,11 +76,10 @@ def test_travel_of_a_block_that_slides(flume: Scene, trajectory_of):
     assert result["centroid_travel"] == pytest.approx(0.7)
     # Seven columns at x = 0.125 .. 0.425; 0.425 + 0.7 alone is past x = 1.1.
     assert result["mass_past_section"] == pytest.approx(1 / 7)
-    np.testing.assert_allclose(measures.runout_over_time(trajectory), steps)
-    np.testing.assert_allclose(measures.runout_over_time(trajectory, quantile=0.5), steps)
-    np.testing.assert_allclose(
-        measures.centroid_over_time(trajectory)[:, 0] - start[:, 0].mean(), steps
-    )
+    centroid = measures.centroid_over_time(trajectory)[:, 0] - start[:, 0].mean()
+    median = measures.runout_over_time(trajectory, quantile=0.5)
+    for travel in (measures.runout_over_time(trajectory), median, centroid):
+        np.testing.assert_allclose(travel, steps, atol=1e-12)
     np.testing.assert_allclose(measures.height_over_time(trajectory), 0.225)
 
 
@@ -151,26 +150,29 @@ def test_depth_is_read_in_the_window_upstream_of_the_face(flume: Scene, trajecto
 
 
 def test_a_thin_spray_is_no_depth(flume: Scene, trajectory_of):
-    """2 cm of mean depth in the window of 0.10 x 0.15 m are needed: 300 points of 1 cm3."""
+    """2 cm of mean depth in the window are needed: here exactly 300 points."""
+    length = measures.WINDOW_LENGTH
+    volume = 0.02 * length * 0.15 / 300
     rng = np.random.default_rng(0)
-    cloud = rng.uniform([0.60, 0.1, 0.30], [0.70, 0.4, 0.45], (1, 300, 3))
-    full = trajectory_of(cloud, flume, point_volume=1e-6)
+    cloud = rng.uniform([0.70 - length, 0.1, 0.30], [0.70, 0.4, 0.45], (1, 300, 3))
+    full = trajectory_of(cloud, flume, point_volume=volume)
     assert measures.summary(full)["upstream_depth"] > 0.28
-    thin = trajectory_of(cloud[:, 1:], flume, point_volume=1e-6)
+    thin = trajectory_of(cloud[:, 1:], flume, point_volume=volume)
     assert measures.summary(thin)["upstream_depth"] == 0.0
 
 
 @given(st.integers(0, 10_000))
 def test_depth_agrees_with_the_definition_spelled_out(flume: Scene, trajectory_of, seed: int):
-    trajectory = trajectory_of(random_cloud(flume, seed), flume, point_volume=2e-4)
+    volume, length = 2e-4, measures.WINDOW_LENGTH
+    trajectory = trajectory_of(random_cloud(flume, seed), flume, point_volume=volume)
     depth = measures.upstream_depth_over_time(trajectory)
     for t, frame in enumerate(trajectory.positions):
         for b, (lower, upper) in enumerate(flume.baffle_boxes()):
             inside = (
-                (frame[:, 0] >= lower[0] - 0.1) & (frame[:, 0] <= lower[0])
+                (frame[:, 0] >= lower[0] - length) & (frame[:, 0] <= lower[0])
                 & (frame[:, 2] >= lower[2]) & (frame[:, 2] <= upper[2])
             )  # fmt: skip
-            enough = inside.sum() * 2e-4 >= 0.02 * 0.1 * 0.15
+            enough = inside.sum() * volume >= 0.02 * length * 0.15
             expected = np.quantile(frame[inside, 1] - 0.1, 0.98) if enough else 0.0
             assert depth[t, b] == pytest.approx(expected, abs=1e-9)
 
@@ -179,7 +181,7 @@ def test_depth_agrees_with_the_definition_spelled_out(flume: Scene, trajectory_o
 def test_free_depth_tiles_the_placement_area(flume: Scene, trajectory_of, seed: int):
     bare = flume.with_baffles([])
     trajectory = trajectory_of(random_cloud(bare, seed), bare, point_volume=1e-3)
-    depth = measures.upstream_depth_over_time(trajectory)
+    depth = measures.upstream_depth_over_time(trajectory, window=0.10)
     assert depth.shape == (5, 9 * 12)  # 0.9 m by 0.10 m, 1.8 m by 0.15 m
     frame = trajectory.positions[2]
     for i, k in ((0, 0), (4, 7), (8, 11)):
@@ -192,7 +194,7 @@ def test_free_depth_tiles_the_placement_area(flume: Scene, trajectory_of, seed: 
 
 def test_free_depth_without_placement_lies_downstream_of_the_front(plane_scene: Scene):
     bare = plane_scene.replace(baffles=())
-    lower, size, counts = measures.depth_tiles(bare)
+    lower, size, counts = measures.depth_tiles(bare, window=0.1)
     assert lower == pytest.approx([0.2]) and size == pytest.approx([0.1]) and counts == [8]
 
 

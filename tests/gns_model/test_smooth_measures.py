@@ -58,7 +58,7 @@ def test_a_deep_heap_has_its_depth(flume: Scene):
     columns = cloud[:, :, 0] < 1.2
     cloud[..., 1] = 0.1 + (cloud[..., 1] - 0.1) * columns
     smooth = smooth_measures(cloud, flume, centres, sizes, point_volume=1e-4)
-    face = (cloud[..., 0] >= 0.6) & (cloud[..., 0] <= 0.7)
+    face = (cloud[..., 0] >= 0.7 - measures.WINDOW_LENGTH) & (cloud[..., 0] <= 0.7)
     inside = face & (cloud[..., 2] >= 0.3) & (cloud[..., 2] <= 0.45)
     hard = max(float(torch.quantile(c[i, 1] - 0.1, 0.98)) for c, i in zip(cloud, inside))
     assert float(smooth["upstream_depth"]) == pytest.approx(hard, abs=0.03)
@@ -139,9 +139,10 @@ def test_smooth_maximum_never_exceeds():
 
 def test_window_is_one_inside_half_on_the_edge_and_zero_outside(flume: Scene):
     centres, sizes = layout_of(flume)
-    points = torch.tensor([[[0.65, 0.2, 0.375], [0.70, 0.2, 0.375], [0.65, 0.2, 0.30],
-                            [0.80, 0.2, 0.375], [0.65, 0.2, 0.6]]], dtype=torch.float64)  # fmt: skip
-    weights = window_weights(points, centres, sizes, 1e-3)
+    x = 0.70 - measures.WINDOW_LENGTH / 2  # the middle of the window of the first baffle
+    points = torch.tensor([[[x, 0.2, 0.375], [0.70, 0.2, 0.375], [x, 0.2, 0.30],
+                            [0.80, 0.2, 0.375], [x, 0.2, 0.6]]], dtype=torch.float64)  # fmt: skip
+    weights = window_weights(points, centres, sizes, 5e-4)
     assert weights.shape == (1, 3, 5)
     np.testing.assert_allclose(weights[0, 0], [1, 0.5, 0.5, 0, 0], atol=1e-9)
 
@@ -155,7 +156,7 @@ def test_empty_windows_are_finite_and_shallow(flume: Scene):
         where = centres.to(dtype).requires_grad_()
         depth = smooth_measures(positions, flume, where, sizes.to(dtype))["upstream_depth"]
         gradients = torch.autograd.grad(depth, (positions, where))
-        assert 0 <= float(depth) < 1e-3
+        assert 0 <= float(depth.detach()) < 1e-3
         assert all(torch.isfinite(g).all() for g in gradients)
 
 
@@ -172,7 +173,8 @@ def test_moving_a_baffle_into_a_heap_raises_the_depth(flume: Scene):
     """The window's own gradient: a heap just upstream of the window draws the baffle's depth up."""
     rng = np.random.default_rng(6)
     heap = torch.tensor(rng.uniform([0.55, 0.1, 0.9], [0.65, 0.4, 1.1], (1, 500, 3)))
-    centres = torch.tensor([[0.835, 1.0]], dtype=torch.float64, requires_grad=True)
+    face = 0.66 + measures.WINDOW_LENGTH
+    centres = torch.tensor([[face + 0.075, 1.0]], dtype=torch.float64, requires_grad=True)
     depth = smooth_measures(heap, flume, centres, (0.15, 0.3, 0.15), point_volume=1e-5)
     (gradient,) = torch.autograd.grad(depth["upstream_depth"], centres)
     assert gradient[0, 0] < 0

@@ -1,0 +1,233 @@
+"""The command `gns-model`: simulate, validate, generate, train, evaluate."""
+
+from __future__ import annotations
+
+import json
+import os
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from gns_model import console
+from gns_model.errors import GnsError
+from gns_model.scene import Scene, write_whole
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    help="Simulators of granular flow: the MPM reference solver and the graph network.",
+)
+
+Workers = Annotated[
+    int, typer.Option(min=1, help="Processes, one thread each.", show_default="all cores")
+]
+Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bar.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+CORES = os.cpu_count() or 1
+
+
+class Family(StrEnum):
+    """Families of random scenes."""
+
+    random = "random"
+    flume = "flume"
+    layouts = "layouts"
+
+
+@app.command()
+def simulate(
+    scene: Annotated[Path, typer.Argument(help="Scene file (TOML).")],
+    out: Annotated[Path, typer.Option(help="Trajectory file to write (HDF5).")],
+    simulator: Annotated[
+        str, typer.Option(help="mpm, a shipped model, or a checkpoint folder.")
+    ] = "mpm",
+    threads: Annotated[int, typer.Option(min=1, help="Threads of the solver.")] = CORES,
+    spacing: Annotated[
+        float | None, typer.Option(help="Of the solver's points [m]; default: the paper's.")
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Run one scene and write its trajectory."""
+    from gns_model import measures
+    from gns_model.simulator import load_simulator
+
+    options: dict[str, Any] = {}
+    if simulator == "mpm":
+        options = {"threads": threads, "spacing": spacing}
+    elif spacing is not None:
+        raise GnsError(f"--spacing is the solver's; {simulator!r} has one of its own")
+    runner = load_simulator(simulator, **options)
+    loaded = Scene.from_toml(scene)
+    runner.check(loaded)
+    with console.progress_bar(quiet=quiet) as bar:
+        task = bar.add_task(f"{runner.name}: {loaded.name}", total=1.0)
+        trajectory = runner.rollout([loaded], progress=lambda f: bar.update(task, completed=f))[0]
+    trajectory.save(out)
+    print(f"{out}: {trajectory.status}, {trajectory.positions.shape[1]} points")
+    for key, value in measures.summary(trajectory).items():
+        print(f"  {key:20s} {value:10.4f} {measures.UNITS[key]}")
+
+
+@app.command()
+def validate(
+    as_json: Json = False,
+    workers: Workers = CORES,
+    spacing: Annotated[
+        float | None, typer.Option(help="Of the flume's points [m]; default: the paper's.")
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Run the reference solver on the paper's six columns and its flume, and compare."""
+    from gns_model import validation
+
+    with console.progress_bar(quiet=quiet) as bar:
+        task = bar.add_task("reference solver on the paper's scenes", total=1.0)
+        result = validation.validate(
+            workers=workers,
+            flume_spacing=spacing,
+            progress=lambda f: bar.update(task, completed=f),
+        )
+    if as_json:
+        print(json.dumps(result, indent=2))
+        return
+    console.print_table(
+        f"Normalised runout of columns, base friction {result['base_friction']:g} (calibrated)",
+        ["a = H0/L0", "H0 x L0 (m)", "points", "solver", "paper's MPM", "error"],
+        [
+            [
+                f"{row['aspect']:g}",
+                f"{row['height']:g} x {row['length']:g}",
+                str(row["points"]),
+                f"{row['runout']:.3f}",
+                f"{row['paper_mpm']:.3f}",
+                f"{row['error']:+.1%}",
+            ]
+            for row in result["columns"]
+        ],
+    )
+    flume = result["flume"]
+    seconds = {k: flume[k] for k in ("row_1_arrival", "row_2_arrival", "rest")}
+    print("Flume: " + ", ".join(f"{k} {v:.3f} s" for k, v in seconds.items() if v is not None))
+    print("Runout of the front (m): " + str({k: round(v, 2) for k, v in flume["runout"].items()}))
+    console.print_table(
+        "Peak upstream depth by definition (paper: nearly 0.3 m)",
+        ["definition", "depth (m)"],
+        [[key, f"{value:.3f}"] for key, value in flume["upstream_depth"].items()],
+    )
+    print(f"Points that were ever inside a baffle: {flume['points_inside_baffles']}")
+    print("within the stated bounds" if result["passed"] else "OUTSIDE the stated bounds")
+
+
+@app.command()
+def generate(
+    out: Annotated[Path, typer.Option(help="Folder of the dataset.")],
+    family: Annotated[Family, typer.Option(help="Family of scenes.")] = Family.random,
+    count: Annotated[int, typer.Option(min=1, help="Trajectories in all shards.")] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the scenes.")] = 0,
+    workers: Workers = CORES,
+    spacing: Annotated[
+        float | None, typer.Option(help="Of the solver's points [m]; default: the paper's.")
+    ] = None,
+    shard: Annotated[str, typer.Option(help="i/n: make every n-th trajectory from the i-th.")] = (
+        "0/1"
+    ),
+    quiet: Quiet = False,
+) -> None:
+    """Make training data with the reference solver; a rerun goes on where it stopped."""
+    from gns_model.data.generate import generate as run
+    from gns_model.data.generate import parse_shard
+
+    with console.progress_bar(quiet=quiet) as bar:
+        task = bar.add_task(f"{family.value} scenes", total=count)
+        paths = run(
+            out,
+            family=family.value,
+            count=count,
+            seed=seed,
+            spacing=spacing,
+            workers=workers,
+            shard=parse_shard(shard),
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+        )
+    print(f"{len(paths)} trajectories in {out}")
+
+
+@app.command()
+def train(
+    recipe: Annotated[Path, typer.Argument(help="Recipe (TOML), see examples/recipes.")],
+    out: Annotated[Path, typer.Option(help="Folder for weights, state, logs and plot.")],
+    resume: Annotated[bool, typer.Option(help="Go on from the state in --out, if any.")] = True,
+    ranks: Annotated[
+        int, typer.Option(min=1, help="Local processes; under torchrun leave it at 1.")
+    ] = 1,
+) -> None:
+    """Train a learned simulator."""
+    from gns_model.training import Recipe, launch
+    from gns_model.training import train as run
+
+    loaded = Recipe.from_toml(recipe)
+    if ranks > 1:
+        launch(recipe, out, ranks, resume=resume)
+    else:
+        print(run(loaded, out, resume=resume))
+
+
+@app.command()
+def evaluate(
+    model: Annotated[str, typer.Argument(help="Shipped model, checkpoint folder, or mpm.")],
+    data: Annotated[Path, typer.Option(help="Folder of reference trajectories (HDF5).")],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for results.json, results.csv and figures.")
+    ] = None,
+    count: Annotated[int, typer.Option(min=1, help="Use at most so many trajectories.")] = 1000,
+    gradients: Annotated[
+        int, typer.Option(min=0, help="Scenes to check design gradients on, at full length.")
+    ] = 0,
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Compare a simulator with reference trajectories that it has not seen."""
+    from gns_model.evaluation import compare, gradient_check
+    from gns_model.simulator import load_simulator
+    from gns_model.trajectory import Trajectory
+
+    simulator = load_simulator(model)
+    files = sorted(data.glob("*.h5"))[:count]
+    if not files:
+        raise GnsError(f"{data}: no trajectory files (*.h5)")
+    references = [Trajectory.load(file) for file in files]
+    with console.progress_bar(quiet=quiet) as bar:
+        task = bar.add_task(f"{model} on {len(files)} scenes", total=1.0)
+        comparison = compare(
+            simulator, references, progress=lambda f: bar.update(task, completed=f)
+        )
+    result = comparison.to_dict()
+    if gradients:
+        checks = [gradient_check(simulator, r.scene) for r in references[:gradients]]
+        result["gradient_cosine"] = [check.cosine for check in checks]
+    if out is not None:
+        from gns_model.evaluation_figures import deposit_figure, scatter_figure
+
+        write_whole(out / "results.json", json.dumps(result, indent=2).encode())
+        comparison.to_csv(out / "results.csv")
+        scatter_figure(comparison, out / "scatter.png")
+        deposit_figure(comparison, out / "deposits.png")
+    if as_json:
+        print(json.dumps(result, indent=2))
+        return
+    console.show(comparison.table())
+    if gradients:
+        print("cosine of gradient and central differences:", result["gradient_cosine"])
+    if out is not None:
+        print(f"results in {out}")
+
+
+def main() -> None:
+    """Entry point."""
+    console.main(app, "gns-model")
+
+
+if __name__ == "__main__":
+    main()
