@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.text import Text
 from PIL import Image
 
 from design import views, wording
-from design.figures import layout_colour, shown_flows
-from design.results import SOLVER, Design, RunResults
-from design.theme import DARK, Theme
+from design.flow_figures import Shown, shown_flows
+from design.results import Design, RunResults
+from design.theme import DARK, Theme, layout_colour
 from gns_model.scene import write_whole
 from gns_model.trajectory import Trajectory
 
@@ -30,11 +33,11 @@ def write_animation(run: RunResults, *, most_bytes: int = MOST_BYTES) -> Path | 
 
     One dark version serves both themes of the page: a film is dark on either.
     """
-    flows = shown_flows(run)
-    if not flows:
+    shown = shown_flows(run)
+    if shown is None:
         return None
     for dpi in (110, 92, 76, 60):
-        content = _gif(_frames(flows, DARK, dpi))
+        content = _gif(_frames(shown, DARK, dpi))
         if len(content) <= most_bytes:
             break
     path = run.folder / "flow.gif"
@@ -48,11 +51,11 @@ def slow_motion(flow: Trajectory) -> float:
     return FRAMES * FRAME_MS / 1000 / span if span > 0 else 1.0
 
 
-def _frames(flows: list[tuple[Design, Trajectory]], theme: Theme, dpi: int) -> list[Image.Image]:
-    times = np.linspace(0.0, float(min(flow.time[-1] for _, flow in flows)), FRAMES)
-    slower = slow_motion(flows[0][1])
+def _frames(shown: Shown, theme: Theme, dpi: int) -> list[Image.Image]:
+    times = np.linspace(0.0, float(min(flow.time[-1] for _, flow in shown.flows)), FRAMES)
+    slower = slow_motion(shown.flows[0][1])
     with mpl.rc_context(theme.rc()):
-        figure, panels, clock = _stage(flows, theme)
+        figure, panels, clock = _stage(shown, theme)
         canvas = FigureCanvasAgg(figure)
         figure.set_dpi(dpi)
         pictures = []
@@ -66,8 +69,11 @@ def _frames(flows: list[tuple[Design, Trajectory]], theme: Theme, dpi: int) -> l
     return pictures
 
 
-def _stage(flows: list[tuple[Design, Trajectory]], theme: Theme):
-    """The figure with everything that does not move, and what does: (flow, map, image)."""
+def _stage(
+    shown: Shown, theme: Theme
+) -> tuple[Figure, list[tuple[Trajectory, Callable[..., views.Map], AxesImage]], Text]:
+    """The figure with everything that does not move, and what does: (flow, map, image), clock."""
+    flows = shown.flows
     scene = flows[0][1].scene
     plan = scene.dim == 3
     length, height = scene.domain.size[0], views.side_top(scene) - scene.base
@@ -75,7 +81,7 @@ def _stage(flows: list[tuple[Design, Trajectory]], theme: Theme):
     column = 4.1 if len(flows) > 1 else 6.0
     # Title, note and tick labels need a fixed height; the views scale with the column.
     figure = Figure(
-        figsize=(column * len(flows), 0.93 * column * sum(ratios) / length + 1.35),
+        figsize=(column * len(flows), 0.88 * column * sum(ratios) / length + 1.35),
         layout="constrained",
     )
     figure.get_layout_engine().set(w_pad=0.08, h_pad=0.05, wspace=0.0, hspace=0.0)
@@ -102,13 +108,12 @@ def _stage(flows: list[tuple[Design, Trajectory]], theme: Theme):
             text += f" · centroid {quantity.text(travel['centroid_travel'])}"
         column_axes[0].set_title(text, color=colour)
         column_axes[-1].set_xlabel("x [m]")
-    by = "reference solver" if flows[0][1].simulator == SOLVER else "learned simulator"
     clock = figure.suptitle(" ", color=theme.ink, x=0.012, ha="left", fontsize=10.5)
-    figure.text(0.988, 0.985, by, color=theme.muted, ha="right", va="top", fontsize=9)
+    figure.text(0.988, 0.985, shown.by, color=theme.muted, ha="right", va="top", fontsize=9)
     return figure, panels, clock
 
 
-def _top(flows: list[tuple[Design, Trajectory]], to_map) -> float:
+def _top(flows: list[tuple[Design, Trajectory]], to_map: Callable[..., views.Map]) -> float:
     """One colour scale for all panels of a kind: nearly the largest value at a few instants."""
     seen = [
         to_map(flow, frame).values.ravel()
@@ -120,7 +125,7 @@ def _top(flows: list[tuple[Design, Trajectory]], to_map) -> float:
 
 
 def _gif(pictures: list[Image.Image]) -> bytes:
-    """One palette for all frames: without it colours flicker and nothing between frames is equal."""
+    """One palette for all frames: with a palette each, colours would flicker."""
     chosen = [np.asarray(pictures[int(k * (len(pictures) - 1))]) for k in (0.2, 0.5, 1.0)]
     palette = Image.fromarray(np.concatenate(chosen)).quantize(
         128, kmeans=1, dither=Image.Dither.NONE

@@ -111,7 +111,7 @@ def optimize(
             batch=batch,
         )
         folder = out if out is not None else Path("runs") / given.name
-        summary = optimise(given, folder, settings, quiet=quiet)
+        summary = optimise(given, folder, settings, command=console.command(), quiet=quiet)
         if not quiet:
             _show(summary, folder)
 
@@ -156,7 +156,7 @@ def _spec(name: str, spacing: float | None, device: str) -> SimulatorSpec:
     except RuntimeError:
         raise SimulatorError(f"no device {device!r}: give cpu or cuda") from None
     if kind not in ("cpu", "cuda") or (kind == "cuda" and not torch.cuda.is_available()):
-        raise SimulatorError(f"device {device!r} is not there: give cpu" + " or cuda" * (kind != "cuda"))
+        raise SimulatorError(f"device {device!r} is not there: give cpu, or cuda on a GPU machine")
     return SimulatorSpec(name, device=device)
 
 

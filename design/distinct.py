@@ -28,7 +28,7 @@ def apart(
     *,
     avoid: Sequence[np.ndarray] = (),
 ) -> list[np.ndarray]:
-    """The first `count` of `layouts` at least `least` [m] from `avoid` and from each earlier one."""
+    """The first `count` of `layouts` at least `least` [m] from `avoid` and each earlier one."""
     chosen: list[np.ndarray] = []
     for layout in layouts:
         if len(chosen) == count:

@@ -1,4 +1,4 @@
-"""A layout as an SVG drawing for the page: plan in 3D, elevation in 2D, coloured by the page's CSS."""
+"""A layout as an SVG drawing for the page: plan in 3D, elevation in 2D; the page colours it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Run layouts: as one batch in this process, or one by one in workers; the searches see no difference.
+"""Run layouts, as one batch in this process or one by one in workers: a search sees no difference.
 
 On a GPU a batch is one block-diagonal graph and fills the device; on a CPU one-thread processes do
 more (findings/SPEED.md).

@@ -29,7 +29,7 @@ from gns_model.trajectory import DIVERGED, OK, Trajectory
 if TYPE_CHECKING:
     from torch import Tensor
 
-#: First step of a chain [m]: a fifth of the paper's baffle; Adam moves every coordinate by about it.
+#: First step of a chain [m], a fifth of the paper's baffle: the most that a coordinate moves.
 STEP = 0.03
 #: Steps shorter than this end a chain [m]: less than anybody builds to.
 LEAST_STEP = 0.003
@@ -103,7 +103,8 @@ class Chain:
         self._best = self.centres
         self._best_gradient: np.ndarray | None = None
         self._misses = 0
-        self._forget()
+        self._mean: np.ndarray = np.zeros_like(self.centres)
+        self._square, self._count = 0.0, 0
 
     def learn(self, outcome: Outcome) -> None:
         """Take in the outcome at `centres` and move on."""
@@ -140,7 +141,8 @@ class Chain:
         return np.clip(self.step * mean / max(scale, 1e-12), -self.step, self.step)
 
     def _forget(self) -> None:
-        self._mean, self._square, self._count = np.zeros_like(self.centres), 0.0, 0
+        self._mean = np.zeros_like(self.centres)
+        self._square, self._count = 0.0, 0
 
 
 def differentiate(task: BaffleTask, layouts: Sequence[np.ndarray]) -> list[Outcome]:

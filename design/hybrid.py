@@ -1,4 +1,4 @@
-"""Hybrid search: Optuna looks around, gradients leap from the best it found, and it learns from them.
+"""Hybrid search: Optuna looks around, gradients leap from the best, and it learns from the leaps.
 
 After BO-Leap (Antonova et al. 2022): the landscape is rugged with useful local gradients, so a
 global model chooses where to start and gradients finish the job. Steps of a leap are told back to

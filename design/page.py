@@ -28,7 +28,7 @@ a{color:var(--best);text-underline-offset:2px}
  background:color-mix(in srgb,var(--tone) 13%,transparent);color:var(--tone)}
 .ok{--tone:var(--good)}.warn{--tone:var(--bad)}
 section{margin-top:52px}
-section>p:first-of-type{margin-bottom:18px}
+section>h2+figure,section>h2+div{margin-top:16px}section>p:first-of-type{margin-bottom:18px}
 .card{background:var(--paper);border:1px solid var(--line);border-radius:12px;padding:22px 24px}
 .answer{display:grid;grid-template-columns:minmax(0,1.22fr) minmax(0,1fr);gap:28px;margin-top:28px}
 .stack{display:flex;flex-direction:column;gap:16px}
@@ -89,7 +89,7 @@ pre{background:var(--ground);border:1px solid var(--line);border-radius:8px;padd
 .columns table{font-size:13.5px}.columns td{padding:6px 0 6px 14px;overflow-wrap:anywhere;
  white-space:normal}.columns td:first-child{color:var(--muted)}
 .note{border-left:3px solid var(--bad);padding:2px 0 2px 16px;margin:22px 0 0}
-.note ul{margin:4px 0 0;padding-left:18px}
+.note p{margin:6px 0 0}.note ul{margin:4px 0 0;padding-left:18px}
 footer{margin-top:56px;color:var(--muted);font-size:13px}
 @media(max-width:820px){.answer{grid-template-columns:1fr}main{padding:28px 16px 48px}
  .card{padding:16px}}

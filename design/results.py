@@ -7,6 +7,7 @@ report says in words what is not there. A part that is there but broken is named
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 import math
 from collections.abc import Iterator, Sequence
@@ -61,12 +62,13 @@ class Design:
 
 @dataclass
 class Trial:
-    """One rollout of the search; `cost` is None if it failed."""
+    """One rollout of the search; `cost` is None if it failed, `centres` [m] (n, D-1) or None."""
 
     number: int
     origin: str
     cost: float | None
     measures: dict[str, float]
+    centres: np.ndarray | None = None
 
 
 class RunResults:
@@ -126,6 +128,7 @@ class RunResults:
                             str(row.get("origin") or "search"),
                             cost,
                             _numbers({k: row.get(k) for k in measures.UNITS}),
+                            _placed(row),
                         )
                     )
         except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -136,6 +139,12 @@ class RunResults:
     def designs(self) -> list[Design]:
         """Best first, then the other ranked layouts, the scene's own and no baffles."""
         found = [self._design("best", self.summary.get("best"))]
+        tried = [t for t in self.trials if t.cost is not None]
+        if not _any(found[0]) and tried:
+            # Interrupted before a summary: the table of trials still knows which was best.
+            lowest = min(tried, key=lambda t: t.cost if t.cost is not None else math.inf)
+            found[0].centres, found[0].cost = lowest.centres, lowest.cost
+            found[0].surrogate, found[0].origin = lowest.measures, lowest.origin
         rank = 1
         for entry in self.summary.get("ranked") or []:
             design = self._design(f"rank-{rank}", entry)
@@ -156,6 +165,19 @@ class RunResults:
             found.append(design)
         return [d for d in found if d.surrogate or d.verified or (d.key == "best" and _any(d))]
 
+    @cached_property
+    def searcher(self) -> str:
+        """What to call the simulator that the search looked through."""
+        settings = self.summary.get("settings")
+        simulator = settings.get("simulator") if isinstance(settings, dict) else None
+        name = simulator.get("name") if isinstance(simulator, dict) else simulator
+        return "search's own solver" if name == SOLVER else "learned simulator"
+
+    @property
+    def complete(self) -> bool:
+        """Whether the run says that it reached its end."""
+        return self.summary.get("status") == "complete"
+
     def design(self, key: str) -> Design | None:
         """The layout under `key`, or None if the run holds nothing about it."""
         return next((d for d in self.designs if d.key == key), None)
@@ -171,10 +193,6 @@ class RunResults:
                 self.problems.append(str(error))
                 self._trajectories[name] = None
         return self._trajectories[name]
-
-    def flow(self, key: str) -> Trajectory | None:
-        """The best trajectory there is of a layout: the solver's, else the learned one's."""
-        return self.trajectory(key, SOLVER) or self.trajectory(key, LEARNED)
 
     def compared(self) -> Iterator[Design]:
         """The layouts that both simulators have judged."""
@@ -217,6 +235,17 @@ def _numbers(values: Any) -> dict[str, float]:
         return {}
     known = {name: _number(values.get(name)) for name in measures.UNITS}
     return {name: number for name, number in known.items() if number is not None}
+
+
+def _placed(row: dict[str, Any]) -> np.ndarray | None:
+    """The layout of a trial, from its columns x1, z1, x2, ... (x1, x2, ... in 2D)."""
+    layout = []
+    for k in itertools.count(1):
+        centre = [_number(row[f"{axis}{k}"]) for axis in "xz" if f"{axis}{k}" in row]
+        if not centre or None in centre:
+            break
+        layout.append(centre)
+    return _centres(layout) if layout else None
 
 
 def _centres(layout: Sequence[Any]) -> np.ndarray:

@@ -17,280 +17,284 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import importlib.metadata
 import json
 import os
-import platform
 import socket
 import time
 import warnings
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from design import bayes, gradient, hybrid
-from design.campaign import Campaign, Evaluator, Search
+from design.campaign import Campaign, Evaluator
 from design.evaluators import InProcess, InWorkers, KnownReference, SimulatorSpec, TaskSpec
 from design.evaluators import differentiable as has_gradient
-from design.store import Pending, Rolled, RolloutStore
+from design.settings import METHODS, Settings
+from design.store import Pending, Rolled, RolloutStore, Watch
+from design.summary import (
+    COMPLETE,
+    INTERRUPTED,
+    PARTIAL,
+    results,
+    versions,
+    write_layouts,
+    write_summary,
+    write_trials,
+)
 from design.trials import Outcome, StudyError, Trial, TrialLog, sqlite_url, storage_errors
-from design.verify import Judged, candidates, gap, rank, verdict
-from design.workers import Workers, as_completed, default_count
+from design.verify import Judged, candidates, rank
+from design.workers import Workers, default_count
 from gns_env.layout import LayoutSpace
-from gns_env.objective import Objective
 from gns_env.task import BaffleTask
 from gns_model.console import progress_bar
-from gns_model.errors import GnsError, SimulatorError
-from gns_model.scene import Scene, write_whole
+from gns_model.errors import SimulatorError
+from gns_model.scene import Scene
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-METHODS: dict[str, Search] = {
-    "bayes": bayes.search,
-    "gradient": gradient.search,
-    "hybrid": hybrid.search,
-}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Settings:
-    """What can be chosen about a run.
-
-    Attributes:
-        method: "bayes", "gradient" or "hybrid"; None: hybrid where the simulator has a gradient.
-        baffles: how many; None: as many as the scene has, or 3.
-        budget: passes through a rollout that the search may spend.
-        verify: how many of the best layouts the reference solver judges; 0: none at all.
-        seed: of everything random.
-        simulator, verifier: who searches and who judges.
-        objective: what to make small.
-        storage: Optuna storage address; None: SQLite in the run folder.
-        resume: go on with what the run folder and the storage hold.
-        workers: processes of one thread; None: one a core, as many as are of use.
-        batch: layouts proposed at a time.
-    """
-
-    method: str | None = None
-    baffles: int | None = None
-    budget: int = 64
-    verify: int = 4
-    seed: int = 0
-    simulator: SimulatorSpec = SimulatorSpec("baffle-lite")
-    verifier: SimulatorSpec = SimulatorSpec("mpm")
-    objective: Objective = Objective()
-    storage: str | None = None
-    resume: bool = False
-    workers: int | None = None
-    batch: int = 8
-
-    def __post_init__(self) -> None:
-        for name, least in (("budget", 1), ("verify", 0), ("batch", 1), ("seed", 0)):
-            value = getattr(self, name)
-            if value < least:
-                raise GnsError(f"{name} must be {least} or more, got {value}")
-        if self.workers is not None and self.workers < 1:
-            raise GnsError(f"workers must be 1 or more, got {self.workers}")
-        if self.method is not None and self.method not in METHODS:
-            raise GnsError(f"no method {self.method!r}: give {', '.join(METHODS)}")
-
 
 def optimise(
-    scene: Scene, out: str | os.PathLike[str], settings: Settings | None = None, *, quiet: bool = True
+    scene: Scene,
+    out: str | os.PathLike[str],
+    settings: Settings | None = None,
+    *,
+    command: Sequence[str] = (),
+    quiet: bool = True,
 ) -> dict[str, Any]:
     """Search, verify, and write the run folder `out`.
+
+    Args:
+        command: the command line to quote in the report.
+        quiet: no progress on stderr.
 
     Returns:
         what summary.json holds.
 
     Raises:
-        GnsError: for what the user has to change; OSError: for what the machine has to.
-            Whatever was finished is in the run folder then, and `resume` goes on from it.
+        GnsError: for what the user has to change; OSError: for what the machine has to. Whatever
+            was finished stands in the run folder then, and `Settings.resume` goes on from it.
     """
-    run = Run(scene, Path(out), settings or Settings())
-    with storage_errors(run.storage):
-        with progress_bar(quiet=quiet) as bar, Workers(run.workers) as workers:
+    run = Run(scene, Path(out), settings or Settings(), command)
+    with storage_errors(run.storage), progress_bar(quiet=quiet) as bar:
+        run.open()
+        with Workers(run.workers) as workers:
             try:
-                run.go(workers, bar)
+                run.simulate(workers, bar)
             except BaseException:
-                with contextlib.suppress(OSError, GnsError):
-                    run.write(complete=False)
+                with contextlib.suppress(Exception):  # the first error is the one to tell
+                    run.write(INTERRUPTED)
                 raise
-        run.publish()
+        run.publish(bar)
     return run.summary
 
 
-@dataclass
 class Run:
-    """The state of one run; `summary` is what it has so far."""
+    """The state of one run; `summary` is what it has so far.
 
-    scene: Scene
-    out: Path
-    settings: Settings
-    ranked: list[Judged] = field(default_factory=list)
-    paper: Judged | None = None
-    none: Judged | None = None
-    seconds: dict[str, float] = field(default_factory=dict)
-    summary: dict[str, Any] = field(default_factory=dict)
+    Attributes:
+        ranked: the layouts found, best first, verified once they are.
+        paper, none: the scene's own layout, if it has one, and no baffles.
+        seconds: spent on each stage.
+    """
 
-    def __post_init__(self) -> None:
-        s = self.settings
-        self.began = time.perf_counter()
-        self.n = s.baffles if s.baffles is not None else (len(self.scene.baffles) or 3)
-        self.space = LayoutSpace(self.scene, self.n)
-        self.bare = self.scene.replace(baffles=(), placement=self.space.placement)
-        self.notes: list[str] = []
-        for spec in (s.simulator, s.verifier) if s.verify else (s.simulator,):
-            with warnings.catch_warnings(record=True) as caught:
-                warnings.simplefilter("always")
-                spec.load().check(self.scene)
-            self.notes += [str(w.message) for w in caught]
-        able = has_gradient(s.simulator.load())
-        self.method = s.method or ("hybrid" if able else "bayes")
-        if self.method != "bayes" and not able:
-            raise SimulatorError(
-                f"the simulator {s.simulator.name!r} has no gradient, so --method {self.method} "
-                "cannot use it: choose a learned simulator such as baffle-lite, or --method bayes"
-            )
-        of_use = max(s.batch, s.verify + 2)
-        self.workers = s.workers or max(1, min(default_count(), of_use))
-        self.storage = s.storage or sqlite_url(self.out / "study.db")
-        self.log: TrialLog | None = None
+    def __init__(
+        self, scene: Scene, out: Path, settings: Settings, command: Sequence[str] = ()
+    ) -> None:
+        self._began = time.perf_counter()
+        self.scene, self.out, self.settings, self.command = scene, out, settings, list(command)
+        self.ranked: list[Judged] = []
+        self.paper: Judged | None = None
+        self.none: Judged | None = None
+        self.seconds: dict[str, float] = {}
+        self.summary: dict[str, Any] = {}
         self.reference_rollouts = 0
+        self.baffles = settings.baffles or len(scene.baffles) or 3
+        self.space = LayoutSpace(scene, self.baffles)
+        self.bare = scene.replace(baffles=(), placement=self.space.placement)
+        self.notes = _check(scene, settings)
+        self.method = settings.method or (
+            "hybrid" if has_gradient(settings.simulator.load()) else "bayes"
+        )
+        if self.method != "bayes" and not has_gradient(settings.simulator.load()):
+            raise SimulatorError(
+                f"the simulator {settings.simulator.name!r} has no gradient, so --method "
+                f"{self.method} cannot use it: choose a learned simulator such as baffle-lite, or "
+                "--method bayes"
+            )
+        of_use = max(settings.batch, settings.verify + 2)
+        self.workers = settings.workers or max(1, min(default_count(), of_use))
+        self.storage = settings.storage or sqlite_url(out / "study.db")
+        self._log: TrialLog | None = None
+
+    @property
+    def log(self) -> TrialLog:
+        """The trials; `open` comes first."""
+        if self._log is None:
+            raise RuntimeError("the run is not open")
+        return self._log
 
     # -- stages --------------------------------------------------------------------------------
 
-    def go(self, workers: Workers, bar: Progress) -> None:
-        """Everything up to the numbers: search, verification, trajectories, summary."""
-        self._open()
-        store = RolloutStore(self.out, workers)
-        s = self.settings
-        searched = self._start_references(store, s.simulator)
-        verified = self._start_references(store, s.verifier) if s.verify else {}
-        watched = _Watch(bar, "verify: no baffles, own layout", list(verified.values()))
+    def open(self) -> None:
+        """Make or find the run folder and the study.
 
-        with self._timed("search"):
-            reference = self._finish(searched["none"], watched, bar)
-            self.none = self._judged("none", reference, None)
-            if "paper" in searched:
-                rolled = self._finish(searched["paper"], watched, bar)
-                self.paper = self._judged("scene", rolled, reference)
-                self._log_own_layout(rolled)
-            self._search(workers, reference, watched, bar)
-            self.write(complete=False)
-        if s.verify:
-            with self._timed("verify"):
-                self._verify(store, verified, watched, bar)
-        else:
-            self.ranked = self._candidates(1)
-        with self._timed("trajectories"):
-            self._name_trajectories(store, searched, verified)
-        self.write(complete=True)
-
-    def publish(self) -> None:
-        """Geometry, figures and report, from what stands in the run folder."""
-        from design.geometry import write_geometry
-        from design.report import write_report
-
-        with self._timed("report"):
-            if self.ranked:
-                best = self.bare.with_baffles(self.ranked[0].centres)
-                write_geometry(best, self.out / "layouts", "best")
-            write_report(self.out)
-        self.write(complete=True)
-
-    def _open(self) -> None:
+        Raises:
+            StudyError: if there is a run already and it is not to be resumed, or of another task.
+        """
         s = self.settings
         if not s.resume and (self.out / "summary.json").exists():
             raise StudyError(
                 f"{self.out} already holds a run: go on with --resume, or choose another --out"
             )
         self.out.mkdir(parents=True, exist_ok=True)
-        self.scene.to_toml(self.out / "scene.toml")
         task = {
             "scene": self.bare.to_dict(),
-            "number of baffles": self.n,
+            "number of baffles": self.baffles,
             "objective": asdict(s.objective),
             "simulator": s.simulator.describe(),
         }
         # A storage that is shared holds many studies: the task tells them apart.
         digest = hashlib.sha256(json.dumps(task, sort_keys=True).encode()).hexdigest()[:8]
         name = f"{self.scene.name}-{digest}" if s.storage else "gns-design"
-        self.log = TrialLog.open(
+        self._log = TrialLog.open(
             self.storage, name, self.space, task, resume=s.resume, owned=s.storage is None
         )
+        self.scene.to_toml(self.out / "scene.toml")
 
-    def _start_references(self, store: RolloutStore, spec: SimulatorSpec) -> dict[str, Pending]:
+    def simulate(self, workers: Workers, bar: Progress) -> None:
+        """Everything up to the numbers: search, verification, trajectories."""
+        store = RolloutStore(self.out, workers)
+        s = self.settings
+        searched = self._references(store, s.simulator)
+        verified = self._references(store, s.verifier) if s.verify else {}
+        watch = Watch(bar)
+        watch.add("search: no baffles, own layout", list(searched.values()))
+        watch.add("verify: no baffles, own layout", list(verified.values()))
+
+        with self._timed("search"):
+            reference = self._take_in(searched, watch)
+            self._search(workers, reference, watch)
+        self.write(PARTIAL)
+        with self._timed("verify"):
+            if s.verify:
+                self._verify(store, verified, watch)
+            else:
+                self.ranked = self._candidates(1)
+        with self._timed("trajectories"):
+            self._name_trajectories(store, searched, verified)
+        self.write(COMPLETE)
+
+    def publish(self, bar: Progress) -> None:
+        """Geometry, figures and report, from what stands in the run folder."""
+        from design.geometry import write_geometry
+        from design.report import write_report
+
+        task = bar.add_task("report", total=1)
+        with self._timed("report"):
+            if self.ranked:
+                best = self.bare.with_baffles(self.ranked[0].centres)
+                write_geometry(best, self.out / "layouts", "best")
+            write_report(self.out)
+        bar.advance(task)
+        self.write(COMPLETE)
+
+    def write(self, status: str) -> None:
+        """summary.json, trials.csv and layouts/ from what there is so far."""
+        s, trials = self.settings, self.log.trials()
+        ranked = self.ranked or self._candidates(1)
+        total = time.perf_counter() - self._began
+        self.summary = {
+            "status": status,
+            **results(ranked, self.paper, self.none, trials, s.objective),
+            "reference_rollouts": self.reference_rollouts,
+            "seconds": {k: round(v, 2) for k, v in {**self.seconds, "total": total}.items()},
+            "notes": self.notes,
+            "command": self.command,
+            "settings": {
+                "scene": self.scene.name,
+                "method": self.method,
+                "baffles": self.baffles,
+                "budget": s.budget,
+                "verify": s.verify,
+                "seed": s.seed,
+                "batch": s.batch,
+                "workers": self.workers,
+                "simulator": {**s.simulator.describe(), "device": s.simulator.device},
+                "verify_with": s.verifier.describe(),
+                "objective": {**asdict(s.objective), "text": str(s.objective)},
+                "storage": self.storage.rsplit("@", 1)[-1],
+            },
+            "versions": versions(),
+        }
+        write_summary(self.out, self.summary)
+        write_trials(self.out, self.log)
+        write_layouts(self.out, self.bare, ranked)
+
+    # -- what the stages do --------------------------------------------------------------------
+
+    def _references(self, store: RolloutStore, spec: SimulatorSpec) -> dict[str, Pending]:
         scenes = {"none": self.bare}
         if self.scene.baffles:
             scenes["paper"] = self.scene.replace(placement=self.space.placement)
         return {key: store.start(spec, scene) for key, scene in scenes.items()}
 
-    def _finish(self, pending: Pending, watched: _Watch, bar: Progress) -> Rolled:
-        if pending.job is not None:
-            task = bar.add_task("search: no baffles, own layout", total=1.0)
-            for _ in as_completed(
-                [pending.job],
-                lambda: (watched(), bar.update(task, completed=pending.fraction))[0],
-            ):
-                pass
-            bar.remove_task(task)
-        return pending.result()
-
-    def _judged(self, origin: str, rolled: Rolled, reference: Rolled | None) -> Judged:
-        """A rollout by the search's simulator of a layout that it did not propose."""
+    def _take_in(self, searched: dict[str, Pending], watch: Watch) -> Rolled:
+        """What the search's simulator says of no baffles and of the scene's own layout."""
         by = self.settings.objective
-        if rolled.status != "ok" and reference is None:
+        watch.wait(list(searched.values()))
+        none = searched["none"].result()
+        if none.status != "ok":
             raise SimulatorError(
                 f"the rollout of {self.settings.simulator.name} without baffles ended as "
-                f"{rolled.status!r}, so no cost can be relative to it"
+                f"{none.status!r}, so no cost can be relative to it"
             )
-        against = reference.measures if reference else rolled.measures
-        ok = rolled.status == "ok"
-        cost = by.cost(rolled.measures, against) if ok else by.failure_cost
-        centres = [] if origin == "none" else [b.center for b in self.scene.baffles]
-        return Judged(
-            origin,
-            np.array(centres, dtype=float).reshape(-1, self.scene.dim - 1),
-            rolled.measures if ok else {},
-            cost,
-        )
+        empty = np.zeros((0, self.scene.dim - 1))
+        cost = by.cost(none.measures, none.measures)
+        self.none = Judged("none", empty, none.measures, cost)
+        if "paper" in searched:
+            own = searched["paper"].result()
+            ok = own.status == "ok"
+            self.paper = Judged(
+                "scene",
+                np.array([baffle.center for baffle in self.scene.baffles], dtype=float),
+                own.measures if ok else {},
+                by.cost(own.measures, none.measures) if ok else by.failure_cost,
+            )
+            self._log_own_layout(own)
+        return none
 
     def _log_own_layout(self, rolled: Rolled) -> None:
         """The scene's own layout is a trial too, where the search could have proposed it."""
-        assert self.log is not None and self.paper is not None and self.paper.cost is not None
         own = self.paper
+        assert own is not None and own.cost is not None  # noqa: PT018
         same_size = all(np.allclose(b.size, self.space.size) for b in self.scene.baffles)
-        if len(own.centres) != self.n or not same_size or self.space.check(own.centres):
+        if len(own.centres) != self.baffles or not same_size or self.space.check(own.centres):
             return
-        if any(t.origin == "scene" for t in self.log.trials()):
-            return
-        outcome = Outcome(own.cost, own.surrogate, rolled.status, seconds=rolled.seconds)
-        self.log.add("scene", own.centres, outcome)
+        if not any(trial.origin == "scene" for trial in self.log.trials()):
+            outcome = Outcome(own.cost, own.surrogate, rolled.status, seconds=rolled.seconds)
+            self.log.add("scene", own.centres, outcome)
 
-    def _search(
-        self, workers: Workers, reference: Rolled, watched: _Watch, bar: Progress
-    ) -> None:
-        assert self.log is not None
+    def _search(self, workers: Workers, reference: Rolled, watch: Watch) -> None:
         s, log = self.settings, self.log
-        task = bar.add_task(f"search: {self.method}", total=s.budget, completed=log.spent())
         best = log.best()
         lowest = best.cost if best else float("inf")
+        bar = watch.bar
+        task = bar.add_task(f"search: {self.method}", total=s.budget, completed=log.spent())
 
         def on_trial(trial: Trial) -> None:
             nonlocal lowest
             lowest = min(lowest, trial.cost)
-            spent = trial.outcome.rollouts + trial.outcome.backwards
             bar.update(task, description=f"search: {self.method}, best {lowest:.4f}")
-            bar.advance(task, spent)
+            bar.advance(task, trial.outcome.rollouts + trial.outcome.backwards)
 
         METHODS[self.method](
             Campaign(
                 log=log,
-                evaluator=self._evaluator(workers, reference.path, watched),
+                evaluator=self._evaluator(workers, reference.path, watch),
                 budget=s.budget,
                 seed=s.seed,
                 batch=s.batch,
@@ -299,55 +303,42 @@ class Run:
             )
         )
 
-    def _evaluator(self, workers: Workers, reference: Path, watched: _Watch) -> Evaluator:
+    def _evaluator(self, workers: Workers, reference: Path, watch: Watch) -> Evaluator:
         s = self.settings
         if s.simulator.device != "cpu":
             simulator = KnownReference(s.simulator.load(), reference)
             return InProcess(
-                BaffleTask(self.bare, simulator, n_baffles=self.n, objective=s.objective)
+                BaffleTask(self.bare, simulator, n_baffles=self.baffles, objective=s.objective)
             )
-        spec = TaskSpec.of(self.bare, self.n, s.objective, s.simulator, reference)
-        return InWorkers(workers, spec, watched)
+        spec = TaskSpec.of(self.bare, self.baffles, s.objective, s.simulator, reference)
+        return InWorkers(workers, spec, watch.update)
 
     def _candidates(self, count: int) -> list[Judged]:
-        assert self.log is not None
         # Closer than a third of a baffle is one design.
         least = float(min(self.space.size[[0, *range(2, self.scene.dim)]])) / 3
         own = [] if self.paper is None else [self.paper.centres]
         return candidates(self.log.trials(), count, least, avoid=own)
 
     def _verify(
-        self,
-        store: RolloutStore,
-        references: dict[str, Pending],
-        watched: _Watch,
-        bar: Progress,
+        self, store: RolloutStore, references: dict[str, Pending], watch: Watch
     ) -> None:
         s = self.settings
         chosen = self._candidates(s.verify)
-        pending = [
-            store.start(s.verifier, self.bare.with_baffles(j.centres), trajectory=False)
-            for j in chosen
-        ]
-        watched.add(f"verify: best {len(chosen)}", pending)
-        jobs = [p.job for p in (*references.values(), *pending) if p.job is not None]
-        for _ in as_completed(jobs, watched):
-            pass
-        rolled = references["none"].result()
-        if rolled.status != "ok":
+        scenes = [self.bare.with_baffles(judged.centres) for judged in chosen]
+        pending = [store.start(s.verifier, scene, trajectory=False) for scene in scenes]
+        watch.add(f"verify: best {len(chosen)}", pending)
+        watch.wait([*references.values(), *pending])
+        none = references["none"].result()
+        if none.status != "ok":
             raise SimulatorError(
-                f"the reference rollout without baffles ended as {rolled.status!r}: nothing can be "
+                f"the reference rollout without baffles ended as {none.status!r}: nothing can be "
                 "verified"
             )
-        reference = rolled.measures
-        assert self.none is not None
-        self.none.judge(rolled.status, rolled.measures, reference, s.objective)
-        if self.paper is not None and "paper" in references:
-            own = references["paper"].result()
-            self.paper.judge(own.status, own.measures, reference, s.objective)
-        for judged, job in zip(chosen, pending, strict=True):
-            done = job.result()
-            judged.judge(done.status, done.measures, reference, s.objective)
+        judged = [(self.none, references["none"]), (self.paper, references.get("paper"))]
+        for layout, job in (*judged, *zip(chosen, pending, strict=True)):
+            if layout is not None and job is not None:
+                done = job.result()
+                layout.judge(done.status, done.measures, none.measures, s.objective)
         self.reference_rollouts = len(pending) + len(references)
         self.ranked = rank(chosen)
 
@@ -358,79 +349,19 @@ class Run:
         verified: dict[str, Pending],
     ) -> None:
         s = self.settings
-        searched, verified = dict(searched), dict(verified)
+        roles = {"learned": (s.simulator, dict(searched)), "mpm": (s.verifier, dict(verified))}
         if self.ranked:
             best = self.bare.with_baffles(self.ranked[0].centres)
-            searched["best"] = store.start(s.simulator, best)
-            if s.verify:
-                verified["best"] = store.start(s.verifier, best)
-        named: set[Path] = set()
-        for role, pendings in (("learned", searched), ("mpm", verified)):
-            for key, pending in pendings.items():
-                rolled = pending.result()
+            for spec, pending in roles.values():
+                if pending:
+                    pending["best"] = store.start(spec, best)
+        named = set()
+        for role, (_, pending) in roles.items():
+            for key, job in pending.items():
+                rolled = job.result()
                 store.name(rolled, f"{key}-{role}")
                 named.add(rolled.path)
         store.prune(named)
-
-    # -- what is written -----------------------------------------------------------------------
-
-    def write(self, *, complete: bool) -> None:
-        """summary.json, trials.csv and layouts/ from what there is so far."""
-        trials = self.log.trials() if self.log is not None else []
-        ranked = self.ranked or (self._candidates(1) if trials else [])
-        best = ranked[0] if ranked else None
-        baseline = self.settings.objective.baseline
-        word, sentence = verdict(best, self.paper, baseline)
-        self.summary = {
-            "complete": complete,
-            "verdict": word,
-            "verdict_text": sentence,
-            "best": best.as_dict() if best else None,
-            "paper_layout": _flat(self.paper),
-            "no_baffles": _flat(self.none),
-            "ranked": [j.as_dict() for j in ranked],
-            "gap": gap([j for j in (*ranked, self.paper, self.none) if j is not None]),
-            "rollouts": sum(t.outcome.rollouts for t in trials),
-            "backwards": sum(t.outcome.backwards for t in trials),
-            "reference_rollouts": self.reference_rollouts,
-            "failed": sum(not t.ok for t in trials),
-            "seconds": {
-                **{k: round(v, 2) for k, v in self.seconds.items()},
-                "total": round(time.perf_counter() - self.began, 2),
-            },
-            "notes": self.notes,
-            "settings": self._settings(),
-            "versions": _versions(),
-        }
-        text = json.dumps(self.summary, indent=2, allow_nan=False)
-        write_whole(self.out / "summary.json", text.encode())
-        if self.log is not None:
-            self.log.write_csv(self.out / "trials.csv")
-        layouts = self.out / "layouts"
-        layouts.mkdir(exist_ok=True)
-        for k, judged in enumerate(ranked, start=1):
-            name = "best.toml" if k == 1 else f"rank-{k}.toml"
-            self.bare.with_baffles(judged.centres).to_toml(layouts / name)
-        for stale in layouts.glob("rank-*.toml"):
-            if int(stale.stem.removeprefix("rank-")) > len(ranked):
-                stale.unlink()
-
-    def _settings(self) -> dict[str, Any]:
-        s = self.settings
-        return {
-            "scene": self.scene.name,
-            "method": self.method,
-            "baffles": self.n,
-            "budget": s.budget,
-            "verify": s.verify,
-            "seed": s.seed,
-            "batch": s.batch,
-            "workers": self.workers,
-            "simulator": {**s.simulator.describe(), "device": s.simulator.device},
-            "verify_with": s.verifier.describe(),
-            "objective": {**asdict(s.objective), "text": str(s.objective)},
-            "storage": self.storage.rsplit("@", 1)[-1],
-        }
 
     @contextlib.contextmanager
     def _timed(self, stage: str) -> Iterator[None]:
@@ -441,38 +372,18 @@ class Run:
             self.seconds[stage] = time.perf_counter() - started
 
 
-class _Watch:
-    """Shows how far rollouts in workers are; called now and then by whoever waits."""
-
-    def __init__(self, bar: Progress, title: str, pending: list[Pending]) -> None:
-        self._bar, self._shown = bar, []
-        self.add(title, pending)
-
-    def add(self, title: str, pending: list[Pending]) -> None:
-        running = [p for p in pending if p.job is not None]
-        if running:
-            self._shown.append((self._bar.add_task(title, total=len(running)), running))
-
-    def __call__(self) -> None:
-        for task, pending in self._shown:
-            self._bar.update(task, completed=sum(p.fraction for p in pending))
-
-
-def _flat(judged: Judged | None) -> dict[str, Any] | None:
-    """Verified measures, with what else is known of the layout beside them."""
-    return None if judged is None else {**(judged.verified or {}), **judged.as_dict()}
+def _check(scene: Scene, settings: Settings) -> list[str]:
+    """Refuse what the simulators cannot run; return what they warn of."""
+    notes = []
+    for spec in (settings.simulator, *([settings.verifier] if settings.verify else [])):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            spec.load().check(scene)
+        notes += [str(warning.message) for warning in caught]
+    return notes
 
 
 def _salt() -> int:
     """A number of this process, for the random numbers of searches that share a study."""
     place = f"{socket.gethostname()}-{os.getpid()}"
     return int.from_bytes(hashlib.sha256(place.encode()).digest()[:4], "big")
-
-
-def _versions() -> dict[str, str]:
-    names = ("gns", "torch", "numpy", "numba", "optuna", "cvxpy")
-    versions = {"python": platform.python_version(), "machine": platform.machine()}
-    for name in names:
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            versions[name] = importlib.metadata.version(name)
-    return versions

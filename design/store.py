@@ -14,14 +14,19 @@ import json
 import os
 import shutil
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from design.evaluators import SimulatorSpec
-from design.workers import Job, Workers, report
+from design.workers import Job, Workers, as_completed, report
 from gns_model import measures as hard
 from gns_model.errors import GnsError
 from gns_model.scene import Scene, write_whole
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 
 @dataclass(frozen=True)
@@ -97,6 +102,30 @@ class RolloutStore:
         for path in (self.folder / "rollouts").glob("*.h5"):
             if path not in named:
                 path.unlink()
+
+
+class Watch:
+    """Shows how far rollouts in workers are, while somebody waits for this or for another."""
+
+    def __init__(self, bar: Progress) -> None:
+        self.bar = bar
+        self._shown: list[tuple[Any, list[Pending]]] = []
+
+    def add(self, title: str, pending: Sequence[Pending]) -> None:
+        """Show those of `pending` that were not found finished as one bar."""
+        running = [p for p in pending if p.job is not None]
+        if running:
+            self._shown.append((self.bar.add_task(title, total=len(running)), running))
+
+    def update(self) -> None:
+        """Draw what is known now."""
+        for task, pending in self._shown:
+            self.bar.update(task, completed=sum(p.fraction for p in pending))
+
+    def wait(self, pending: Sequence[Pending]) -> None:
+        """Return when all of `pending` have ended."""
+        for _ in as_completed([p.job for p in pending if p.job is not None], self.update):
+            self.update()
 
 
 def simulate_job(spec: SimulatorSpec, scene: str, path: Path, slot: int) -> None:

@@ -14,6 +14,9 @@ from typing import Any
 from matplotlib import font_manager
 from matplotlib.colors import LinearSegmentedColormap
 
+#: Width of a figure across the page [inch].
+WIDTH = 10.4
+
 #: Wanted first, for a page that is read beside system-ui text; DejaVu comes with matplotlib.
 FONTS = ("Inter", "Helvetica Neue", "Helvetica", "Arial", "Liberation Sans", "DejaVu Sans")
 
@@ -121,6 +124,11 @@ DARK = Theme(
 )
 
 THEMES = (LIGHT, DARK)
+
+
+def layout_colour(theme: Theme, key: str) -> str:
+    """The colour of a layout, the same in every figure; ranks after the first share one."""
+    return {"best": theme.best, "paper": theme.own, "none": theme.none}.get(key, theme.sand[2])
 
 
 @cache

@@ -1,4 +1,4 @@
-"""The trials of a search, kept in an Optuna study: one store for every method, on one machine or many.
+"""The trials of a search, in an Optuna study: one store for every method, on one machine or many.
 
 Baselines, sampled layouts and gradient steps all end as trials of one study in RDB storage (SQLite
 in the run folder by default, PostgreSQL across machines), so a search resumes, is shared and is
@@ -24,7 +24,6 @@ from optuna.trial import FrozenTrial, TrialState
 from design.parameters import names, ordered, to_centres, to_parameters
 from gns_env.layout import LayoutSpace
 from gns_model.errors import GnsError
-from gns_model.scene import write_whole
 
 optuna.logging.set_verbosity(optuna.logging.ERROR)
 
@@ -211,10 +210,6 @@ class TrialLog:
         """Passes through a rollout so far: forward and backward ones, each counts one."""
         return sum(t.outcome.rollouts + t.outcome.backwards for t in self.trials())
 
-    def write_csv(self, path: Path) -> None:
-        """All trials as a table: number, origin, cost, measures, centres [m]."""
-        write_whole(path, table(self.trials()).encode())
-
 
 def table(trials: Sequence[Trial]) -> str:
     """Trials as CSV text with a header."""
@@ -227,10 +222,8 @@ def table(trials: Sequence[Trial]) -> str:
         for k in range(max((len(t.centres) for t in trials), default=0))
         for j in range(trials[0].centres.shape[1])
     ]
-    writer.writerow(
-        ["number", "origin", "status", "cost", *measures, *columns]
-        + ["rollouts", "backwards", "seconds"]
-    )
+    spent = ["rollouts", "backwards", "seconds"]
+    writer.writerow(["number", "origin", "status", "cost", *measures, *columns, *spent])
     for t in trials:
         o = t.outcome
         writer.writerow(

@@ -1,7 +1,7 @@
 """The best layouts on the reference solver, and how far the search's simulator was off.
 
-A surrogate's optimum is also where its errors are most flattering, so designs are ranked anew by the
-reference solver before one is called best (findings/FIELD.md), and the gap is printed.
+A surrogate's optimum is also where its errors are most flattering, so designs are ranked anew by
+the reference solver before one is called best (findings/FIELD.md), and the gap is printed.
 """
 
 from __future__ import annotations
@@ -93,8 +93,8 @@ def gap(judged: Sequence[Judged]) -> dict[str, dict[str, float]]:
     """How the two simulators differ over the layouts that both have judged.
 
     Returns:
-        for "cost" and each measure: `mean_relative` and `max_relative`, of |surrogate - verified| /
-        |verified|, and `spearman`, the rank correlation over three layouts at least (else left out).
+        for "cost" and each measure: over how many `layouts`; `mean_relative` and `max_relative` of
+        |surrogate - verified| / |verified|; `spearman`, the rank correlation, from three layouts.
     """
     both = [j for j in judged if j.verified and j.surrogate]
     result: dict[str, dict[str, float]] = {}

@@ -18,6 +18,7 @@ from matplotlib.ticker import MultipleLocator
 from scipy.ndimage import gaussian_filter
 
 from design.theme import Theme
+from gns_env.rendering import depth_map
 from gns_model.measures import moving_positions
 from gns_model.scene import Scene
 from gns_model.trajectory import Trajectory
@@ -46,29 +47,32 @@ def frame_at(trajectory: Trajectory, time: float) -> int:
 
 def plan_map(trajectory: Trajectory, frame: int, *, cell: float | None = None) -> Map:
     """Depth of material over the plan (x, z) [m] in one frame of a 3D trajectory."""
-    cell = cell or spacing(trajectory)
-    points = moving_positions(trajectory)[frame][:, [0, 2]]
-    density = _density(points, trajectory.scene, (0, 2), cell)
-    return Map(density.values * trajectory.point_volume, density.extent)
+    depth = depth_map(trajectory, frame, cell or spacing(trajectory))
+    low, high = trajectory.scene.domain.lower, trajectory.scene.domain.upper
+    return Map(_blur(depth), (low[0], high[0], low[2], high[2]))
 
 
 def side_map(trajectory: Trajectory, frame: int, *, cell: float | None = None) -> Map:
     """Share of the width [-] that is filled, over (x, y) in one frame; in 2D the packing."""
-    cell = cell or spacing(trajectory)
-    scene = trajectory.scene
-    width = scene.domain.size[2] if scene.dim == 3 else 1.0
+    scene, cell = trajectory.scene, cell or spacing(trajectory)
+    low, high = np.array(scene.domain.lower[:2]), np.array(scene.domain.upper[:2])
+    shape = np.maximum(np.rint((high - low) / cell).astype(int), 1)
     points = moving_positions(trajectory)[frame][:, :2]
-    density = _density(points, scene, (0, 1), cell)
-    return Map(density.values * trajectory.point_volume / width, density.extent)
+    counts, _, _ = np.histogram2d(*points.T, bins=shape, range=list(zip(low, high, strict=True)))
+    width = scene.domain.size[2] if scene.dim == 3 else 1.0
+    filled = counts * trajectory.point_volume / (float(np.prod((high - low) / shape)) * width)
+    return Map(_blur(filled), (low[0], high[0], low[1], high[1]))
 
 
-def surface(trajectory: Trajectory, frame: int, *, cell: float = 0.03) -> tuple[np.ndarray, ...]:
+def surface(
+    trajectory: Trajectory, frame: int, *, cell: float = 0.03
+) -> tuple[np.ndarray, np.ndarray]:
     """Mean depth across the width [m] over x [m] in one frame: two arrays of shape (nx,)."""
-    filled = side_map(trajectory, frame, cell=cell)
-    left, right, bottom, top = filled.extent
-    nx, ny = filled.values.shape
-    x = left + (np.arange(nx) + 0.5) * (right - left) / nx
-    return x, filled.values.sum(1) * (top - bottom) / ny
+    depth = depth_map(trajectory, frame, cell)
+    depth = depth.reshape(len(depth), -1).mean(axis=1)
+    low, high = trajectory.scene.domain.lower[0], trajectory.scene.domain.upper[0]
+    x = low + (np.arange(len(depth)) + 0.5) * (high - low) / len(depth)
+    return x, _blur(depth)
 
 
 def draw_map(axes: Axes, shown: Map, theme: Theme, top: float) -> AxesImage:
@@ -132,14 +136,6 @@ def _frame(axes: Axes, x: tuple[float, float], y: tuple[float, float], ticks: fl
         side.set_visible(True)
 
 
-def _density(points: np.ndarray, scene: Scene, axes: tuple[int, int], cell: float) -> Map:
-    """Points per m² over two axes of the domain, blurred by about a cell without losing any."""
-    low = np.array([scene.domain.lower[a] for a in axes])
-    high = np.array([scene.domain.upper[a] for a in axes])
-    shape = np.maximum(np.round((high - low) / cell).astype(int), 1)
-    size = (high - low) / shape
-    index = np.clip(((points - low) / size).astype(int), 0, shape - 1)
-    counts = np.bincount(index[:, 0] * shape[1] + index[:, 1], minlength=int(shape.prod()))
-    blurred = gaussian_filter(counts.reshape(shape).astype(float), 1.1, mode="reflect")
-    extent = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
-    return Map(blurred / float(size.prod()), extent)
+def _blur(values: np.ndarray) -> np.ndarray:
+    """Smoothed by about a cell; nothing is lost at the walls."""
+    return gaussian_filter(values, 1.1, mode="reflect")

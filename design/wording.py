@@ -48,49 +48,54 @@ def quantities(scene: Scene | None) -> list[Quantity]:
     energy = "J" if scene is None or scene.dim == 3 else "J/m"
     return [
         Quantity("centroid_travel", "Centroid travel", "m", 1, 3, -1,
-                 "How far the centre of mass has moved downstream at the end. Objective."),
+                 "How far the centre of mass has moved downstream at the end."),
         Quantity("upstream_depth", "Peak depth upstream of a baffle", "m", 1, 3, -1,
                  "Deepest flow in the 10 cm before a baffle; without baffles the deepest in "
-                 "windows of the same size. Objective."),
+                 "windows of the same size."),
         Quantity("runout_p99", "Runout, 99th percentile", "m", 1, 3, -1,
-                 "Travel of the front that 1% of the mass lies beyond."),
+                 "Travel of the front that 1 % of the mass lies beyond."),
         Quantity("mass_past_section", f"Mass past {section}", "%", 100, 2, -1,
                  "Share of the mass beyond the control section at the end."),
         Quantity("overtopping", "Mass over a baffle's top", "%", 100, 2, -1,
                  "Share of the mass that crossed above the plan of a baffle at some time."),
         Quantity("energy_dissipated", "Energy dissipated", energy, 1, 0, 0,
-                 "Potential and kinetic energy lost between start and end; mass held back high keeps some."),
+                 "Potential and kinetic energy lost from start to end; mass held high keeps some."),
         Quantity("runout_max", "Farthest grain", "m", 1, 3, 0,
                  "The paper's runout. Single grains decide it: reported, never optimised."),
     ]
 
 
-def change(value: float | None, reference: float | None) -> float | None:
+def relative(value: float | None, reference: float | None) -> float | None:
     """(value - reference) / |reference|, or None where that says nothing."""
     if value is None or reference is None or abs(reference) < 1e-12:
         return None
     return (value - reference) / abs(reference)
 
 
-def percent(share: float | None, digits: int = 1) -> str:
+def percent(value: float | None, digits: int = 1) -> str:
     """A signed share as per cent, with a true minus; an en dash where there is none."""
-    if share is None:
+    if value is None:
         return "–"
-    return f"{100 * share:+.{digits}f}{NBSP}%".replace("-", "−")
+    return f"{100 * value:+.{digits}f}{NBSP}%".replace("-", "−")
 
 
-def verdict(share: float | None, sense: int, name: str = "centroid_travel") -> str:
+def share(value: float) -> str:
+    """A share without its sign, as per cent."""
+    return f"{abs(100 * value):.1f}{NBSP}%"
+
+
+def verdict(change: float | None, sense: int, name: str = "centroid_travel") -> str:
     """"better", "worse", "same", or "" where neither is meant, of a change in a measure."""
-    if share is None or sense == 0:
+    if change is None or sense == 0:
         return ""
-    if negligible(share, name):
+    if negligible(change, name):
         return "same"
-    return "better" if share * sense > 0 else "worse"
+    return "better" if change * sense > 0 else "worse"
 
 
-def negligible(share: float, name: str = "centroid_travel") -> bool:
+def negligible(change: float, name: str = "centroid_travel") -> bool:
     """Whether a relative change of a measure is within the repeatability of the solver."""
-    return abs(share) < REPEATABILITY.get(name, OTHERWISE)
+    return abs(change) < REPEATABILITY.get(name, OTHERWISE)
 
 
 def count(number: int, noun: str) -> str:

@@ -24,8 +24,9 @@ from gns_model.trajectory import DIVERGED, INTERRUPTED, OK, Trajectory
 
 #: Layouts closer than this in every coordinate are one layout [m].
 SAME_LAYOUT = 1e-6
-#: A rollout in which more than this share of the points enters a baffle has failed.
-LEAK_SHARE = 0.05
+#: A rollout has failed in which more than this share of the points enters a baffle or ends more
+#: than LEAK_DEPTH [m] outside the domain; so has one that throws a grain a domain's length away.
+LEAK_SHARE, LEAK_DEPTH = 0.05, 0.01
 #: Status of such a rollout, beside those of `gns_model.trajectory`.
 LEAKED = "leaked"
 #: Evaluations and trajectories that a task remembers.
@@ -248,12 +249,21 @@ def _finite_summary(trajectory: Trajectory) -> tuple[dict[str, float], str]:
     status = trajectory.status
     if status == OK and not np.isfinite(trajectory.positions).all():
         status = DIVERGED
-    values = hard.summary(trajectory)
+    with np.errstate(over="ignore", invalid="ignore"):  # of numbers that are about to be refused
+        values = hard.summary(trajectory)
     if not all(map(math.isfinite, values.values())):
         status = DIVERGED if status == OK else status
         values = {name: v if math.isfinite(v) else 0.0 for name, v in values.items()}
-    if status == OK and trajectory.scene.baffles:
-        inside = hard.points_inside_baffles(trajectory)
-        if inside > LEAK_SHARE * trajectory.positions.shape[1]:
-            status = LEAKED
-    return values, status
+    return values, _leaks(trajectory) if status == OK else status
+
+
+def _leaks(trajectory: Trajectory) -> str:
+    """Status of a finite rollout: "ok", unless its grains are where no grain can be."""
+    domain, last = trajectory.scene.domain, hard.moving_positions(trajectory)[-1]
+    outside = np.maximum(np.array(domain.lower) - last, last - np.array(domain.upper)).max(axis=1)
+    if outside.max() > max(domain.size):
+        return DIVERGED
+    allowed = LEAK_SHARE * len(last)
+    if (outside > LEAK_DEPTH).sum() > allowed or hard.points_inside_baffles(trajectory) > allowed:
+        return LEAKED
+    return OK

@@ -10,6 +10,7 @@ import contextlib
 import signal
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from gns_model.errors import GnsError
@@ -82,6 +83,11 @@ def main(app: Typer, name: str, arguments: list[str] | None = None) -> NoReturn:
 
 def _interrupt(signum: int, frame: object) -> NoReturn:
     raise KeyboardInterrupt
+
+
+def command() -> list[str]:
+    """The command line that this process was started with, to be written down beside its result."""
+    return [Path(sys.argv[0]).name, *sys.argv[1:]]
 
 
 def progress_bar(*, quiet: bool = False) -> Progress:

@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
@@ -62,30 +63,40 @@ def deposit_figure(
         return
     top = max(max(r.deposit.max(), r.reference_deposit.max()) for r in results)
     gap = max(np.abs(r.deposit - r.reference_deposit).max() for r in results) or 1e-3
-    figure = Figure(figsize=(11, 3.5 * len(results) + 0.5), layout="constrained")
-    grid = figure.subplots(len(results), 3, squeeze=False)
+    width, _, depth = results[0].scene.domain.size
+    figure = Figure(
+        figsize=(11, (2.9 * depth / width + 0.6) * len(results) + 0.9), layout="constrained"
+    )
+    grid = figure.subplots(len(results), 3, squeeze=False, sharex=True, sharey=True)
     for row, result in zip(grid, results, strict=True):
         difference = result.deposit - result.reference_deposit
         panels = (
-            (result.reference_deposit, comparison.reference, "YlOrBr", 0.0, top),
-            (result.deposit, comparison.simulator, "YlOrBr", 0.0, top),
-            (difference, "difference", "RdBu_r", -gap, gap),
+            (result.reference_deposit, f"{result.scene.name}: {comparison.reference}", "YlOrBr"),
+            (result.deposit, comparison.simulator, "YlOrBr"),
+            (difference, f"difference: {result.deposit_error:.1%} of the mass", "RdBu_r"),
         )
-        for axes, (values, title, colours, low, high) in zip(row, panels, strict=True):
-            image = _plan(axes, result.scene, values, colours, low, high)
+        for axes, (values, title, colours) in zip(row, panels, strict=True):
+            low, high = (-gap, gap) if colours == "RdBu_r" else (0.0, top)
+            _plan(axes, result.scene, values, colours, low, high)
             axes.set_title(title, fontsize=10)
-            axes.set_xlabel("x [m]")
-        row[0].set_ylabel(f"{result.scene.name}\nz [m]")
-        row[2].set_title(f"difference: {result.deposit_error:.1%} of the mass", fontsize=10)
-        figure.colorbar(row[1].images[0], ax=row[:2].tolist(), label="depth [m]", shrink=0.85)
-        figure.colorbar(image, ax=row[2], label="[m]", shrink=0.85)
+        row[0].set_ylabel("z [m]")
+    for axes in grid[-1]:
+        axes.set_xlabel("x [m]")
+    # One scale for all scenes, so that depths compare down the page as well as across it.
+    for columns, label in ((grid[:, :2], "depth [m]"), (grid[:, 2], "difference [m]")):
+        figure.colorbar(
+            columns.flat[0].images[0], ax=columns.ravel().tolist(), label=label,
+            location="bottom", shrink=0.6, aspect=40 if columns.ndim == 2 else 20,
+        )  # fmt: skip
     save_figure(figure, path)
 
 
-def _plan(axes, scene: Scene, values: np.ndarray, colours: str, low: float, high: float):
+def _plan(
+    axes: Axes, scene: Scene, values: np.ndarray, colours: str, low: float, high: float
+) -> None:
     x, z = scene.domain.lower[0], scene.domain.lower[2]
     extent = (x, x + values.shape[0] * CELL, z, z + values.shape[1] * CELL)
-    image = axes.imshow(
+    axes.imshow(
         values.T, origin="lower", extent=extent, cmap=colours, vmin=low, vmax=high,
         interpolation="nearest",
     )
@@ -95,7 +106,6 @@ def _plan(axes, scene: Scene, values: np.ndarray, colours: str, low: float, high
             Rectangle((lower[0], lower[2]), size[0], size[2], facecolor="0.35", edgecolor="black")
         )
     axes.axvline(scene.control_section, color="0.3", linewidth=0.8, linestyle="--")
-    return image
 
 
 def _profiles(comparison: Comparison, path: str | os.PathLike[str], scenes: int) -> None:

@@ -58,10 +58,44 @@ def edge_mlp(
         of each receiver (N, L); without: message (E, L), and an empty tensor.
     """
     a, b = vertex_terms if vertex_terms is not None else (None, None)
+    if torch.compiler.is_compiling():  # the compiler fuses by itself, and cannot see into ours
+        return _plain(
+            edge, a, b, envelope, senders, receivers, activation, dtype, [first, *weights], biases,
+            norm,
+        )  # fmt: skip
     return _EdgeMLP.apply(
         edge, a, b, envelope, senders, receivers, activation, dtype,
         first, *biases, *weights, *norm,
     )  # fmt: skip
+
+
+def _plain(
+    edge: Tensor,
+    a: Tensor | None,
+    b: Tensor | None,
+    envelope: Tensor | None,
+    senders: Tensor,
+    receivers: Tensor,
+    activation: str,
+    dtype: torch.dtype,
+    weights: list[Tensor],
+    biases: list[Tensor],
+    norm: tuple[Tensor, Tensor],
+) -> tuple[Tensor, Tensor]:
+    """`edge_mlp` in plain operations."""
+    linear = torch.nn.functional.linear
+    hidden = linear(edge.to(dtype), weights[0].to(dtype), biases[0].to(dtype))
+    if a is not None and b is not None:
+        hidden = hidden + a.to(dtype).index_select(0, receivers)
+        hidden = hidden + b.to(dtype).index_select(0, senders)
+    for weight, bias in zip(weights[1:], biases[1:], strict=True):
+        active = torch.nn.functional.silu(hidden) if activation == "silu" else hidden.relu()
+        hidden = linear(active, weight.to(dtype), bias.to(dtype))
+    message = torch.layer_norm(hidden.to(edge.dtype), norm[0].shape, *norm, _EPSILON)
+    if a is None:
+        return message, edge.new_zeros(0)
+    weighted = message if envelope is None else message * envelope
+    return edge + message, torch.zeros_like(a).index_add(0, receivers, weighted)
 
 
 class _Layers:

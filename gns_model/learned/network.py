@@ -98,7 +98,7 @@ class Block(nn.Module):
         envelope: Tensor | None,
         dtype: torch.dtype,
     ) -> tuple[Tensor, Tensor]:
-        """Vertex (N, L) and edge (E, L) latents; envelope (E, 1) or None; dtype of edge products."""
+        """Vertex (N, L) and edge (E, L) latents; envelope (E, 1); dtype of edge products."""
         w_receiver, w_sender, w_edge = self.edge.split_first(*[self.latent] * 3)
         at_receiver = nn.functional.linear(vertex, w_receiver)
         at_sender = nn.functional.linear(vertex, w_sender)

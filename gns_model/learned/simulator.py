@@ -39,6 +39,8 @@ class LearnedSimulator:
         card: what is known about the model.
         threads: torch threads on the CPU during a rollout; default: as torch is set.
         workers: processes that share the scenes of a rollout, on the CPU, one thread each.
+        precision: "bfloat16" makes the products over edges in that dtype: a little faster on a
+            CPU, much on a GPU, at half a percent of error in each step's acceleration.
     """
 
     def __init__(
@@ -49,7 +51,10 @@ class LearnedSimulator:
         *,
         threads: int | None = None,
         workers: int = 1,
+        precision: str = "float32",
     ) -> None:
+        if precision not in ("float32", "bfloat16"):
+            raise SimulatorError(f"precision must be float32 or bfloat16, got {precision!r}")
         for option, value in (("threads", threads), ("workers", workers)):
             if value is not None and value < 1:
                 raise SimulatorError(f"{option} must be at least 1, got {value}")
@@ -59,8 +64,12 @@ class LearnedSimulator:
         self.card = dict(card or {})
         self.threads = threads
         self.workers = workers
+        self.precision = precision
         self._warned: set[str] = set()
         self._pool: Any = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_pool": None}  # a copy starts processes of its own
 
     @property
     def device(self) -> torch.device:
@@ -115,28 +124,52 @@ class LearnedSimulator:
         for scene in scenes:
             self.check(scene)
         if self.workers > 1 and len(scenes) > 1 and self.device.type == "cpu":
-            return self._workers_rollout(scenes, progress)
+            return self._share(scenes, progress)
         points = [fill(scene, self.config.spacing) for scene in scenes]
         work = [len(p.positions) * self.frames(s) for s, p in zip(scenes, points, strict=True)]
         total, done = max(1, sum(work)), 0.0
         trajectories: list[Trajectory] = []
-        for group in _groups([len(p.positions) for p in points], self._batch_points()):
+        for group in groups([len(p.positions) for p in points], self._batch_points()):
             share = sum(work[k] for k in group)
 
             def advance(fraction: float, done: float = done, share: float = share) -> None:
                 if progress is not None:
                     progress(min(1.0, (done + fraction * share) / total))
 
-            with _thread_count(self.threads), torch.inference_mode():
+            with self._settings(), torch.inference_mode():
                 trajectories += self._rollout_batch(
                     [scenes[k] for k in group], [points[k] for k in group], advance
                 )
             done += share
         return trajectories
 
+    def _share(self, scenes: list[Scene], progress: Progress | None) -> list[Trajectory]:
+        from gns_model.learned.workers import WorkerPool  # it imports this module
+
+        if self._pool is None:
+            self._pool = WorkerPool(self, self.workers)
+        try:
+            return self._pool.rollout(scenes, progress)
+        except BaseException:
+            self._pool = None
+            raise
+
     def frames(self, scene: Scene) -> int:
         """Number of frames of a rollout of `scene`, the start included."""
         return 1 + max(1, math.floor(scene.duration / self.config.dt + 1e-6))
+
+    @contextmanager
+    def _settings(self) -> Iterator[None]:
+        before = torch.get_num_threads()
+        try:
+            if self.threads is not None:
+                torch.set_num_threads(self.threads)
+            short = self.precision == "bfloat16"
+            with torch.autocast(self.device.type, torch.bfloat16, enabled=short):
+                yield
+        finally:
+            if self.threads is not None:
+                torch.set_num_threads(before)
 
     def _batch_points(self) -> int:
         return BATCH_POINTS.get(self.device.type, BATCH_POINTS["cuda"])
@@ -147,7 +180,8 @@ class LearnedSimulator:
         began = time.perf_counter()
         moving = [len(p.positions) for p in points]
         frames = [self.frames(scene) for scene in scenes]
-        out = [np.empty((t, n, self.config.dim), np.float32) for t, n in zip(frames, moving, strict=True)]
+        dim = self.config.dim
+        out = [np.empty((t, n, dim), np.float32) for t, n in zip(frames, moving, strict=True)]
         diverged: dict[int, int] = {}
         histories, types = self._start(scenes, points)
         for k, history in enumerate(histories):
@@ -312,7 +346,7 @@ class LearnedSimulator:
         points = [fill(scene, self.config.spacing) for scene in scenes]
         moving = [len(p.positions) for p in points]
         lengths = [frames or self.frames(scene) for scene in scenes]
-        with _thread_count(self.threads):
+        with self._settings():
             histories, types = self._start(scenes, points, centres)
             if noise is not None:
                 for history, shift, n in zip(histories, noise, moving, strict=True):
@@ -342,7 +376,7 @@ def _furthest_step(scene: Scene) -> float:
     return _SPEED_MARGIN * (max(math.hypot(*r.velocity) for r in scene.releases) + fall)
 
 
-def _groups(sizes: Sequence[int], most: int) -> Iterator[list[int]]:
+def groups(sizes: Sequence[int], most: int) -> Iterator[list[int]]:
     """Consecutive indices whose sizes add up to at most `most`, at least one in each group."""
     group: list[int] = []
     for k, size in enumerate(sizes):
@@ -352,15 +386,3 @@ def _groups(sizes: Sequence[int], most: int) -> Iterator[list[int]]:
         group.append(k)
     if group:
         yield group
-
-
-@contextmanager
-def _thread_count(threads: int | None) -> Iterator[None]:
-    before = torch.get_num_threads()
-    try:
-        if threads is not None:
-            torch.set_num_threads(threads)
-        yield
-    finally:
-        if threads is not None:
-            torch.set_num_threads(before)

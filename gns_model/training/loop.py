@@ -178,7 +178,11 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: threadin
                 group["lr"] = rate
             with torch.autocast(ranks.device.type, torch.bfloat16) if autocast else nullcontext():
                 loss = unrolled_loss(
-                    model, batch, steps=steps, backprop=recipe.backprop_through_unroll
+                    model,
+                    batch,
+                    steps=steps,
+                    backprop=recipe.backprop_through_unroll,
+                    linear_beyond=recipe.linear_beyond,
                 )
             optimiser.zero_grad(set_to_none=True)
             loss.backward()

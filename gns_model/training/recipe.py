@@ -50,6 +50,8 @@ class Recipe(BaseModel):
     warmup: Fraction = 0.02  #: of the budget
     decay_steps: Count = 5_000_000
     weight_decay: NonNegative = 1e-4
+    #: Error in standard deviations beyond which the loss grows linearly; none: squares all the way.
+    linear_beyond: Positive | None = None
     clip_norm: Positive = 1.0  #: of the whole gradient
     ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.999
     mirror: bool = True  #: show every other window in a mirror across z; 3D only

@@ -155,7 +155,7 @@ class Validator:
                 raise Interrupted
             window = read(self.index, Draw(source, frame, 0, False, 0.0), unroll=1)
             batch = collate([window], noise_std=0.0, rng=rng, device=self.ranks.device)
-            total += float(unrolled_loss(model, batch, steps=1, backprop=False))
+            total += float(unrolled_loss(model, batch))
             number += 1
         return total, float(number)
 

@@ -92,7 +92,9 @@ def slide(scene, *, spacing=0.05, frames=19, gain=1.0, simulator="mpm", seed=0):
     )
 
 
-def write_run(folder, scene=None, *, layouts=(BEST, SECOND), verified=True, trials=30, **slide_options):
+def write_run(
+    folder, scene=None, *, layouts=(BEST, SECOND), verified=True, trials=30, **slide_options
+):
     """Write a complete (or, with verified=False, an interrupted) run folder; return its path."""
     folder = Path(folder)
     scene = scene or flume()
@@ -145,8 +147,10 @@ def write_run(folder, scene=None, *, layouts=(BEST, SECOND), verified=True, tria
         "seconds": {"search": 93.4, "verify": 61.0, "total": 158.2},
         "versions": {"gns_model": "0.1.0", "torch": "2.13.0", "optuna": "5.0.0"},
         "settings": {"method": "hybrid", "baffles": 3, "budget": trials, "verify": 2, "seed": 0,
-                     "simulator": "baffle-lite"},
-        "command": ["gns-design", "optimize", "examples/flume.toml", "--out", "runs/<demo> & co"],
+                     "simulator": {"name": "models/<mine> & co", "device": "cpu"},
+                     "objective": {"runout_weight": 1.0, "depth_weight": 0.25,
+                                   "text": "centroid travel + 0.25 x upstream depth"}},
+        "notes": ["the scene is 5 % faster than <baffle-lite> was trained for"],
     }
     (folder / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
     scene.to_toml(folder / "scene.toml")

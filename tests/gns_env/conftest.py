@@ -1,4 +1,4 @@
-"""Simulators for tests of the env: the real solver, coarse, and the shipped model if there is one."""
+"""Simulators for tests of the env: the real solver, coarse, and the shipped model if any."""
 
 from __future__ import annotations
 
@@ -76,6 +76,10 @@ class Faulty:
             positions[half:, 3] = np.nan
         elif self.how == "explodes":
             positions[half:] = 3e38
+        elif self.how == "one flies":
+            positions[half:, 3] += 100.0
+        elif self.how == "sinks":
+            positions[half:, :, 1] -= 0.2
         elif self.how == "leaks":
             positions[half:, : positions.shape[1] // 4] = trajectory.scene.baffle_boxes()[0].mean(0)
         return replace(trajectory, positions=positions)

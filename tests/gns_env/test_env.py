@@ -102,9 +102,8 @@ def test_a_failed_rollout_ends_the_episode_with_finite_numbers(
     _, _, terminated, _, info = env.step(np.array([-0.5, -0.5], np.float32))
     assert not terminated
     assert not info["diverged"]
-    with np.errstate(over="ignore", invalid="ignore"):
-        observation, reward, terminated, _, info = env.step(np.array([0.5, 0.5], np.float32))
-        assert env.render().dtype == np.uint8
+    observation, reward, terminated, _, info = env.step(np.array([0.5, 0.5], np.float32))
+    assert env.render().dtype == np.uint8
     assert terminated
     assert info["diverged"]
     assert -15 < reward < -10
@@ -169,7 +168,7 @@ def test_the_shipped_scene_is_the_example(examples: Path, flume: Scene) -> None:
         ({"n_baffles": 500}, LayoutError, "at most"),
         ({"n_baffles": 0}, LayoutError, "1 or more"),
         ({"objective": Objective.pareto()}, ObjectiveError, "one Objective"),
-        ({"render_mode": "human"}, ValueError, "rgb_array"),
+        ({"render_mode": "ansi"}, ValueError, "rgb_array"),
     ],
 )
 def test_bad_arguments_are_refused_when_it_is_made(

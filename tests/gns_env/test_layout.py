@@ -90,7 +90,7 @@ def test_a_projected_layout_is_buildable_and_stands_in_the_scene(
 @pytest.mark.slow
 def test_a_thousand_requests_for_three_and_for_twelve() -> None:
     rng = np.random.default_rng(3)
-    for name, n, times in (("open", 3, 700), ("keep-outs", 5, 250), ("open", 12, 50)):
+    for name, n, times in (("open", 3, 800), ("keep-outs", 3, 180), ("open", 12, 20)):
         space = SPACES[name, n]
         for _ in range(times):
             centres = rng.normal(rng.uniform(space.lower, space.upper), 0.2, (n, 2))
@@ -255,7 +255,7 @@ def test_without_a_placement_everything_downstream_of_the_front() -> None:
         (_flume(placement=_placement(size=(1.0, 0.3, 0.1))), 1, "larger than the placement"),
         (_flume(placement=_placement(size=(0.1, 0.9, 0.1))), 1, "exceed the domain"),
         (_flume(placement=_placement(keep_out=[(0, 0, 2, 2)])), 1, r"keep_out\[0\]: at most 0 do"),
-        (PLANE, 9, r"9 baffles of 0.1 m .* beside keep_out\[0\]: at most 8 do"),
+        (PLANE, 10, r"10 baffles of 0.1 m .* beside keep_out\[0\]: at most 9 do"),
     ],
 )
 def test_an_impossible_number_of_baffles_is_refused_with_the_possible_one(
@@ -268,7 +268,8 @@ def test_an_impossible_number_of_baffles_is_refused_with_the_possible_one(
 def test_as_many_as_the_message_says_do_fit() -> None:
     space = LayoutSpace(_flume(), 36)
     assert space.check(space.project(np.full((36, 2), 1.0))) == []
-    assert LayoutSpace(PLANE, 8).check(LayoutSpace(PLANE, 8).random(np.random.default_rng(0))) == []
+    space = LayoutSpace(PLANE, 9)
+    assert space.check(space.random(np.random.default_rng(0))) == []
 
 
 def test_a_scene_that_names_no_size_is_refused() -> None:

@@ -49,7 +49,9 @@ def test_the_front_is_what_runs_apart_on_a_pareto_front() -> None:
 
 def test_smooth_is_the_same_sum_with_its_gradient() -> None:
     objective = Objective(mass_weight=0.3)
-    tensors = {k: torch.tensor(v, dtype=torch.float64, requires_grad=True) for k, v in MEASURES.items()}
+    tensors = {
+        k: torch.tensor(v, dtype=torch.float64, requires_grad=True) for k, v in MEASURES.items()
+    }
     value = objective.smooth(tensors, REFERENCE)
     value.backward()
     assert value.item() == pytest.approx(objective.cost(MEASURES, REFERENCE), rel=1e-12)

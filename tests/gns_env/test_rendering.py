@@ -1,4 +1,4 @@
-"""Views that say what they should: depth conserves mass, frames differ, baffles are where they are."""
+"""Views that say what they should: depth conserves mass, frames differ, baffles stand."""
 
 from __future__ import annotations
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gns_env.room import free_rectangles, nearest_free, pack
+from gns_env.room import _candidates, _greedy, free_rectangles, nearest_free, pack
 
 AREA = np.array([[0.0, 0.0], [10.0, 6.0]])
 coordinate = st.integers(-2, 12)
@@ -74,39 +76,42 @@ def test_rows_and_columns_when_nothing_is_in_the_way() -> None:
     assert len(places) == bound == 6 * 3
 
 
-def test_a_packing_that_only_the_exact_search_finds() -> None:
-    # One axis, obstacle in the middle: 0..3 and 4.5..7.5 hold two each, 3 apart. The greedy search
-    # goes up from 0 and finds them; turned about, with places from both ends, it has to be exact.
-    free = free_rectangles(np.array([[0.0], [7.5]]), np.array([[[3.0], [4.5]]]))
-    places, bound = pack(free, np.array([3.0]), 5)
-    # 0, 3 and 6 fit with 7.5 - 6 < 3 left over: three is the most (0, 3 | 6..7.5).
-    assert len(places) == bound == 3
+def _most(points: np.ndarray, separation: np.ndarray) -> int:
+    """Size of the largest pairwise separated subset, by plain branching."""
+    if len(points) == 0:
+        return 0
+    clear = (np.abs(points - points[0]) >= separation - 1e-9).any(1)
+    with_first = 1 + _most(points[clear], separation)
+    # Leaving the first out can only help if one of its rivals comes in.
+    rest = points[1:]
+    return max(with_first, _most(rest, separation)) if (~clear[1:]).any() else with_first
 
 
-def test_greedy_choice_is_beaten_by_the_exact_one() -> None:
-    # The lowest corner first blocks both arms of this plus; without it they hold one each.
-    separation = np.array([2.0, 2.0])
-    free = np.array([[[0.0, 1.0], [3.0, 1.0]], [[1.5, 0.0], [1.5, 2.5]]])
-    places, bound = pack(free, separation, 9)
-    # Brute force over a fine raster of the plus.
-    raster = np.unique(
-        np.concatenate(
-            [
-                np.stack([np.arange(0, 3.01, 0.25), np.full(13, 1.0)], 1),
-                np.stack([np.full(11, 1.5), np.arange(0, 2.51, 0.25)], 1),
-            ]
-        ),
-        axis=0,
-    )
-    clear = (np.abs(raster[:, None] - raster[None]) >= separation - 1e-9).any(-1)
-    most = 0
-    for mask in range(3):
-        chosen: list[int] = []
-        for k in np.roll(np.arange(len(raster)), -mask * 5):
-            if all(clear[k, c] for c in chosen):
-                chosen.append(int(k))
-        most = max(most, len(chosen))
-    assert len(places) == bound >= most
+@settings(max_examples=25)
+@given(obstacles(), st.integers(2, 3), st.integers(2, 3))
+def test_the_bound_is_how_many_really_fit(blocked: np.ndarray, along: int, across: int) -> None:
+    # With integers everywhere an optimal packing, pushed to the lower corner, is on integers.
+    area, separation = np.array([[0.0, 0.0], [5.0, 3.0]]), np.array([along, across], dtype=float)
+    x, z = np.meshgrid(np.arange(6.0), np.arange(4.0), indexing="ij")
+    points = np.stack([x.ravel(), z.ravel()], 1)
+    points = points[~_blocked(points, blocked)]
+    places, bound = pack(free_rectangles(area, blocked), separation, 99)
+    assert len(places) == bound == _most(points, separation)
+
+
+def test_the_exact_search_finds_what_the_greedy_one_misses() -> None:
+    area, separation = np.array([[0.0, 0.0], [5.0, 3.0]]), np.array([2.0, 2.0])
+    short = []
+    for corner in itertools.product(range(5), range(3), range(5), range(3)):
+        blocked = np.array([[corner[:2], corner[:2]], [corner[2:], corner[2:]]], dtype=float)
+        blocked[:, 0] -= 0.5
+        blocked[:, 1] += 0.5
+        free = free_rectangles(area, blocked)
+        greedy = _greedy(_candidates(free, separation), separation)
+        places, _ = pack(free, separation, 99)
+        assert len(places) >= len(greedy)
+        short.append(len(places) > len(greedy))
+    assert any(short)
 
 
 @pytest.mark.parametrize("n", [1, 5])

@@ -93,15 +93,19 @@ def test_memory_is_bounded_and_keeps_the_reference(
 
 @pytest.mark.parametrize(
     ("how", "status"),
-    [("says so", "diverged"), ("nan", "diverged"), ("explodes", "diverged"), ("leaks", "leaked")],
+    [
+        ("says so", "diverged"),
+        ("nan", "diverged"),
+        ("explodes", "diverged"),
+        ("one flies", "diverged"),
+        ("leaks", "leaked"),
+        ("sinks", "leaked"),
+    ],
 )
-def test_a_failed_rollout_is_data(
-    small_flume: Scene, faulty: type, how: str, status: str
-) -> None:
+def test_a_failed_rollout_is_data(small_flume: Scene, faulty: type, how: str, status: str) -> None:
     objective = Objective()
     task = BaffleTask(small_flume, faulty(how, at_least=2), n_baffles=2, objective=objective)
-    with np.errstate(over="ignore", invalid="ignore"):
-        good, bad = task.evaluate([ONE, TWO])
+    good, bad = task.evaluate([ONE, TWO])
     assert not good.failed
     assert bad.failed
     assert bad.status == status

@@ -72,7 +72,8 @@ def test_every_release_keeps_its_velocity():
     )
     points = fill(scene, 0.05)
     left = points.positions[:, 0] < 0.3
-    assert left.sum() == 16 and (~left).sum() == 4
+    assert left.sum() == 16
+    assert (~left).sum() == 4
     assert (points.velocities[left] == [1, 0]).all()
     assert (points.velocities[~left] == [-1, 0]).all()
 

@@ -13,7 +13,9 @@ def test_an_unknown_simulator_is_named_with_what_there_is(name: str):
     with pytest.raises(SimulatorError, match="no simulator named") as caught:
         load_simulator(name)
     message = str(caught.value)
-    assert repr(name) in message and "mpm" in message and "\n" not in message
+    assert repr(name) in message
+    assert "mpm" in message
+    assert "\n" not in message
 
 
 def test_a_folder_that_is_no_checkpoint_is_named(tmp_path: Path):
@@ -26,7 +28,8 @@ def test_a_folder_that_is_no_checkpoint_is_named(tmp_path: Path):
 
 def test_mpm_takes_its_options():
     simulator = load_simulator("mpm", spacing=0.03125)
-    assert isinstance(simulator, Simulator) and simulator.name == "mpm"
+    assert isinstance(simulator, Simulator)
+    assert simulator.name == "mpm"
     assert simulator.spacing == 0.03125
     with pytest.raises(SimulatorError, match="spacing must be positive, got -1"):
         load_simulator("mpm", spacing=-1)

@@ -60,7 +60,11 @@ def test_a_deep_heap_has_its_depth(flume: Scene):
     smooth = smooth_measures(cloud, flume, centres, sizes, point_volume=1e-4)
     face = (cloud[..., 0] >= 0.7 - measures.WINDOW_LENGTH) & (cloud[..., 0] <= 0.7)
     inside = face & (cloud[..., 2] >= 0.3) & (cloud[..., 2] <= 0.45)
-    hard = max(float(torch.quantile(c[i, 1] - 0.1, 0.98)) for c, i in zip(cloud, inside))
+    depths = [
+        torch.quantile(frame[there, 1] - 0.1, 0.98)
+        for frame, there in zip(cloud, inside, strict=True)
+    ]
+    hard = float(max(depths))
     assert float(smooth["upstream_depth"]) == pytest.approx(hard, abs=0.03)
 
 
@@ -80,7 +84,8 @@ def test_gradients_equal_central_differences(request, name: str, key: str):
     generator = torch.Generator().manual_seed(0)
     for index, gradient in enumerate(gradients):
         if gradient is None:
-            assert index == 1 and key != "upstream_depth"
+            assert index == 1
+            assert key != "upstream_depth"
             continue
         for _ in range(4):
             direction = torch.randn(inputs[index].shape, generator=generator, dtype=torch.float64)
@@ -128,7 +133,8 @@ def test_smooth_quantile_is_a_quantile(seed: int, q: float):
 def test_smooth_quantile_moves_with_all_values():
     values = torch.linspace(0, 1, 50, dtype=torch.float64).requires_grad_()
     (gradient,) = torch.autograd.grad(smooth_quantile(values, 0.9, 0.05), values)
-    assert float(gradient.sum()) == pytest.approx(1.0) and (gradient >= 0).all()
+    assert float(gradient.sum()) == pytest.approx(1.0)
+    assert (gradient >= 0).all()
 
 
 def test_smooth_maximum_never_exceeds():

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import subprocess
 import sys
@@ -69,7 +70,8 @@ def test_a_truncated_file_is_named(content: bytes, tmp_path_factory, data: st.Da
     for read in (Trajectory.load, open_trajectory):
         with pytest.raises(FileFormatError) as caught:
             read(path)
-        assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+        assert str(path) in str(caught.value)
+        assert "\n" not in str(caught.value)
 
 
 @given(st.data())
@@ -80,10 +82,9 @@ def test_a_damaged_file_reads_or_is_named(content: bytes, tmp_path_factory, data
     for _ in range(data.draw(st.integers(1, 8))):
         damaged[data.draw(st.integers(0, len(content) - 1))] ^= data.draw(st.integers(1, 255))
     path.write_bytes(damaged)
-    try:
-        Trajectory.load(path)
-    except FileFormatError as error:
-        assert str(path) in str(error)
+    with contextlib.suppress(FileFormatError):
+        # Any other exception is a traceback that a user would see.
+        assert np.ndim(Trajectory.load(path).positions) == 3
 
 
 def test_foreign_files_are_named(trajectory: Trajectory, tmp_path: Path):
@@ -148,7 +149,8 @@ def test_a_failed_write_leaves_the_old_file_and_no_half_one(
     before = path.read_bytes()
     with pytest.raises(TypeError):
         dataclasses.replace(trajectory, settings={"not": object()}).save(path)
-    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_full_disk_leaves_no_half_file(trajectory: Trajectory, tmp_path: Path):

@@ -1,0 +1,65 @@
+"""What can be chosen about a run, checked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from design import bayes, gradient, hybrid
+from design.campaign import Search
+from design.evaluators import SimulatorSpec
+from gns_env.objective import Objective
+from gns_model.errors import GnsError
+
+METHODS: dict[str, Search] = {
+    "bayes": bayes.search,
+    "gradient": gradient.search,
+    "hybrid": hybrid.search,
+}
+
+
+class SettingError(GnsError, ValueError):
+    """A setting out of its range: the message names it and what is allowed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """What can be chosen about a run.
+
+    Attributes:
+        method: "bayes", "gradient" or "hybrid"; None: hybrid where the simulator has a gradient.
+        baffles: how many; None: as many as the scene has, or 3.
+        budget: passes through a rollout that the search may spend.
+        verify: how many of the best layouts the reference solver judges; 0: none at all.
+        seed: of everything random.
+        simulator, verifier: who searches and who judges.
+        objective: what to make small.
+        storage: Optuna storage address; None: SQLite in the run folder.
+        resume: go on with what the run folder and the storage hold.
+        workers: processes of one thread; None: one a core, as many as are of use.
+        batch: layouts proposed at a time.
+
+    Raises:
+        SettingError: for a value out of its range.
+    """
+
+    method: str | None = None
+    baffles: int | None = None
+    budget: int = 64
+    verify: int = 4
+    seed: int = 0
+    simulator: SimulatorSpec = field(default_factory=lambda: SimulatorSpec("baffle-lite"))
+    verifier: SimulatorSpec = field(default_factory=lambda: SimulatorSpec("mpm"))
+    objective: Objective = field(default_factory=Objective)
+    storage: str | None = None
+    resume: bool = False
+    workers: int | None = None
+    batch: int = 8
+
+    def __post_init__(self) -> None:
+        least = {"budget": 1, "verify": 0, "batch": 1, "seed": 0, "workers": 1, "baffles": 1}
+        for name, bound in least.items():
+            value = getattr(self, name)
+            if value is not None and value < bound:
+                raise SettingError(f"{name} must be {bound} or more, got {value}")
+        if self.method is not None and self.method not in METHODS:
+            raise SettingError(f"no method {self.method!r}: give {', '.join(METHODS)}")
