@@ -56,15 +56,24 @@ def _frames(shown: Shown, theme: Theme, dpi: int) -> list[Image.Image]:
     slower = slow_motion(shown.flows[0][1])
     with mpl.rc_context(theme.rc()):
         figure, panels, clock = _stage(shown, theme)
-        canvas = FigureCanvasAgg(figure)
         figure.set_dpi(dpi)
+        canvas = FigureCanvasAgg(figure)
+        # Axes and labels are drawn once; a frame is then the maps, what stands on them, the clock.
+        for _, _, image in panels:
+            for artist in (image, *image.axes.patches, *image.axes.lines):
+                artist.set_animated(True)
+        clock.set_animated(True)
+        canvas.draw()
+        still = canvas.copy_from_bbox(figure.bbox)
         pictures = []
         for time in times:
-            clock.set_text(f"t = {time:.2f} s    {slower:.0f}× slower than life")
+            canvas.restore_region(still)
             for flow, to_map, image in panels:
                 image.set_data(views.as_image(to_map(flow, views.frame_at(flow, time))))
-            canvas.draw()
-            figure.set_layout_engine("none")  # laid out once, by the first frame
+                for artist in (image, *image.axes.patches, *image.axes.lines):
+                    image.axes.draw_artist(artist)
+            clock.set_text(f"t = {time:.2f} s    {slower:.0f}× slower than life")
+            figure.draw_artist(clock)
             pictures.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()))
     return pictures
 

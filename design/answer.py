@@ -129,10 +129,11 @@ def _judgement(design: Design, other: Design | None) -> str:
     """Of two verified layouts: "better", "worse", "same"; "" where one is not verified."""
     if other is None or not design.verified or not other.verified:
         return ""
-    if design.verified_cost is not None and other.verified_cost is not None:
-        return wording.verdict(wording.relative(design.verified_cost, other.verified_cost), -1)
-    name = "centroid_travel"
-    return wording.verdict(wording.relative(design.verified.get(name), other.verified.get(name)), -1)
+    mine, theirs = design.verified_cost, other.verified_cost
+    if mine is None or theirs is None:
+        mine = design.verified.get("centroid_travel")
+        theirs = other.verified.get("centroid_travel")
+    return wording.verdict(wording.relative(mine, theirs), -1)
 
 
 def _coordinates(run: RunResults, placed: Scene) -> str:

@@ -10,6 +10,8 @@ import io
 from collections.abc import Callable
 
 import matplotlib as mpl
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -54,9 +56,10 @@ def png(run: RunResults, name: str, theme: Theme) -> bytes | None:
         figure = FIGURES[name](run, theme)
         if figure is None:
             return None
-        raw = io.BytesIO()
-        figure.savefig(raw, dpi=DPI, format="png")
-    picture = Image.open(raw).convert("RGB")
+        figure.set_dpi(DPI)
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
     small = io.BytesIO()
     picture.quantize(256, dither=Image.Dither.NONE).save(small, "PNG", optimize=True)
     return small.getvalue()

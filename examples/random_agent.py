@@ -15,7 +15,7 @@ import numpy as np
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("--simulator", default="baffle-lite", help="mpm, a shipped model or a path")
-parser.add_argument("--episodes", type=int, default=3)
+parser.add_argument("--episodes", type=int, default=5)
 parser.add_argument("--seed", type=int, default=0)
 arguments = parser.parse_args()
 

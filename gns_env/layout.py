@@ -161,10 +161,14 @@ class LayoutSpace:
         if len(c) == 1:
             return nearest_free(self._free, c[0])[None]
         width = self._area[1] - self._area[0]
-        c = np.clip(c, self._area[0] - width, self._area[1] + width)
+        asked, c = c, np.clip(c, self._area[0] - width, self._area[1] + width)
         if len(c) not in self._projectors:
             self._projectors[len(c)] = Projector(self._free, self.separation, self._slots, len(c))
-        return self._projectors[len(c)].nearest(c)
+        # Wishes that were drawn in to one place keep the order that they had outside.
+        sorting = np.lexsort(asked.T[::-1])
+        found = np.empty_like(c)
+        found[sorting] = self._projectors[len(c)].nearest(c[sorting])
+        return found
 
     def place(self, centre: ArrayLike, earlier: ArrayLike) -> Array:
         """The place nearest to `centre` (D-1,) for one more baffle, beside `earlier` (k, D-1) ones.

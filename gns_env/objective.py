@@ -32,11 +32,15 @@ class ObjectiveError(GnsError, ValueError):
 
 @dataclass(frozen=True, kw_only=True)
 class Objective:
-    """cost = runout_weight * R/R0 + depth_weight * H/H0 + mass_weight * M/M0, to be made small.
+    """cost = runout_weight * R/R0 + depth_weight * max(H, H0)/H0 + mass_weight * M/M0, to be small.
 
     R is the `runout` measure, H the upstream depth and M the mass past the control section; R0, H0
     and M0 are those of the same scene without baffles, from the same simulator, so the cost of no
     baffles is the sum of the weights.
+
+    Depth below that of the free flow earns nothing: upstream depth is read at the baffles, so with
+    a plain H/H0 the best layout would be the one that the flow never reaches (in the paper's flume,
+    three baffles at the far end would beat every row in the flow: 1.04 against 1.10).
 
     Attributes:
         runout_weight, depth_weight, mass_weight: [-], none negative, one at least positive.
@@ -103,8 +107,9 @@ class Objective:
         Raises:
             ObjectiveError: if a measure that counts is zero (or not finite) without baffles.
         """
-        cost = float(self._weigh(measures, reference))
-        return cost if math.isfinite(cost) else self.failure_cost
+        if not all(math.isfinite(measures[name]) for name in self.terms):
+            return self.failure_cost
+        return float(self._weigh(measures, reference))
 
     def smooth(self, measures: Mapping[str, Number], reference: Mapping[str, float]) -> Number:
         """The same sum of `smooth_measures`, torch scalars: a scalar to differentiate.
@@ -123,13 +128,18 @@ class Objective:
                     "far, so there is nothing to improve on (give the scene a longer duration or "
                     "another placement or section, or this measure no weight)"
                 )
-            term = cast(Any, measures[name]) * (weight / scale)
+            value: Any = measures[name]
+            if name == "upstream_depth":
+                value = max(value, scale) if isinstance(value, float) else value.clamp(min=scale)
+            term = value * (weight / scale)
             total = term if total is None else total + term
         return cast(Number, total)
 
     def __str__(self) -> str:
         terms = " + ".join(
-            ("" if weight == 1 else f"{weight:g} x ") + _WORDS[name]
+            ("" if weight == 1 else f"{weight:g} x ")
+            + _WORDS[name]
+            + (" (at least the free flow's)" if name == "upstream_depth" else "")
             for name, weight in self.terms.items()
         )
         relative = (

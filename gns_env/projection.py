@@ -52,7 +52,7 @@ class Projector:
     def nearest(self, request: Array) -> Array:
         """Buildable centres near `request` [m], shape (n, d): a local minimum of the summed squared
         distance. It is the same, permuted, for a permuted request."""
-        sorting = np.lexsort(request.T[::-1])
+        sorting = np.lexsort(request.T[::-1])  # stable: equal requests stay in their order
         target = request[sorting]
         best: tuple[float, Array, Arrangement] | None = None
         for start in (self._untied, self._pushed_apart, self._into_slots):

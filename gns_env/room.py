@@ -137,12 +137,14 @@ def _exact(places: Array, separation: Array) -> tuple[Array, int]:
         (places >= corner - ROUNDING).all(1) & (places < corner + separation - ROUNDING).all(1)
         for corner in corners
     ]
-    windows = csr_matrix(np.array([row for row in rows if row.sum() > 1], dtype=float))
+    shared = [row for row in rows if row.sum() > 1]
+    if not shared:
+        return places, len(places)
     result = milp(
         -np.ones(len(places)),
         integrality=np.ones(len(places)),
         bounds=Bounds(0, 1),
-        constraints=LinearConstraint(windows, ub=1) if windows.shape[0] else (),
+        constraints=LinearConstraint(csr_matrix(np.array(shared, dtype=float)), ub=1),
         options={"time_limit": PACKING_SECONDS},
     )
     if result.x is None:

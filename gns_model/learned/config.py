@@ -48,7 +48,7 @@ class Limits(BaseModel):
             if values:
                 single = name in ("max_speed", "release_height")
                 limits[name] = max(values) if single else (min(values), max(values))
-        return cls(**limits)
+        return cls.model_validate(limits)
 
     def broken_by(self, scene: Scene) -> list[str]:
         """One line for every limit that `scene` lies outside of, naming it, value and range."""

@@ -69,6 +69,11 @@ def edge_mlp(
     )  # fmt: skip
 
 
+def add_messages(total: Tensor, receivers: Tensor, messages: Tensor) -> Tensor:
+    """Aggregation: add each message (E, L) to the row of `total` (N, L) of its receiver."""
+    return total.index_add_(0, receivers, messages)
+
+
 def _plain(
     edge: Tensor,
     a: Tensor | None,
@@ -95,7 +100,7 @@ def _plain(
     if a is None:
         return message, edge.new_zeros(0)
     weighted = message if envelope is None else message * envelope
-    return edge + message, torch.zeros_like(a).index_add(0, receivers, weighted)
+    return edge + message, add_messages(torch.zeros_like(a), receivers, weighted)
 
 
 class _Layers:
@@ -216,7 +221,7 @@ class _EdgeMLP(torch.autograd.Function):
                 torch.add(own, message, out=out[tile])
                 if envelope is not None:
                     message *= envelope[tile]
-                total.index_add_(0, to, message)
+                add_messages(total, to, message)
         ctx.save_for_backward(
             edge, a, b, envelope, senders, receivers, *parameters, *kept, *moments
         )
@@ -236,7 +241,8 @@ class _EdgeMLP(torch.autograd.Function):
         sums = [torch.zeros_like(p) for p in parameters] if kept else None
         need_edge, need_envelope = ctx.needs_input_grad[0], ctx.needs_input_grad[3]
         grad_edge = torch.empty_like(edge) if need_edge else None
-        grad_a, grad_b = (None, None) if a is None else (torch.zeros_like(a), torch.zeros_like(b))
+        grad_a = torch.zeros_like(a) if a is not None else None
+        grad_b = torch.zeros_like(b) if b is not None else None
         grad_envelope = torch.empty_like(envelope) if need_envelope else None
 
         for tile in _tiles(edge):
@@ -251,7 +257,7 @@ class _EdgeMLP(torch.autograd.Function):
                 before = [torch.empty_like(hidden) for _ in layers.biases]
                 message, mean, scale = layers.normalise(layers.forward(hidden, before))
             grad = grad_out[tile]
-            if a is not None:
+            if grad_a is not None and grad_b is not None:
                 received = grad_total.index_select(0, to)
                 if grad_envelope is not None and message is not None:
                     grad_envelope[tile] = (message * received).sum(1, keepdim=True)

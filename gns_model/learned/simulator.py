@@ -154,6 +154,12 @@ class LearnedSimulator:
             self._pool = None
             raise
 
+    def close(self) -> None:
+        """End the worker processes, if any run. The next rollout would start new ones."""
+        if self._pool is not None:
+            self._pool.close()
+            self._pool = None
+
     def frames(self, scene: Scene) -> int:
         """Number of frames of a rollout of `scene`, the start included."""
         return 1 + max(1, math.floor(scene.duration / self.config.dt + 1e-6))

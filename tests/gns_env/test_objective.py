@@ -30,9 +30,20 @@ def test_the_default_is_centroid_travel_and_a_quarter_of_depth_relative_to_no_ba
     assert objective.cost(MEASURES, REFERENCE) == pytest.approx(0.57 / 0.6 + 0.25 * 0.2 / 0.1)
     assert objective.cost(REFERENCE, REFERENCE) == pytest.approx(objective.baseline) == 1.25
     assert str(objective) == (
-        "centroid travel + 0.25 x upstream depth, each relative to no baffles "
-        "(no baffles: 1.25; lower is better)"
+        "centroid travel + 0.25 x upstream depth (at least the free flow's), each relative to no "
+        "baffles (no baffles: 1.25; lower is better)"
     )
+
+
+def test_baffles_that_the_flow_never_reaches_earn_nothing() -> None:
+    unreached = {**REFERENCE, "upstream_depth": 0.0}
+    assert Objective().cost(unreached, REFERENCE) == pytest.approx(1.25)
+    depth = torch.tensor(0.01, dtype=torch.float64, requires_grad=True)
+    travel = torch.tensor(0.6, dtype=torch.float64, requires_grad=True)
+    value = Objective().smooth({"centroid_travel": travel, "upstream_depth": depth}, REFERENCE)
+    assert value.item() == pytest.approx(1.25)
+    value.backward()
+    assert (travel.grad, depth.grad) == (pytest.approx(1 / 0.6), 0.0)
 
 
 def test_other_weights_and_measures() -> None:
@@ -68,8 +79,9 @@ def test_smooth_is_the_same_sum_with_its_gradient() -> None:
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_measures_that_are_not_finite_cost_a_failure(bad: float) -> None:
     objective = Objective()
-    cost = objective.cost({**MEASURES, "centroid_travel": bad}, REFERENCE)
-    assert cost == objective.failure_cost == FAILURE_COST * 1.25
+    for name in objective.terms:
+        cost = objective.cost({**MEASURES, name: bad}, REFERENCE)
+        assert cost == objective.failure_cost == FAILURE_COST * 1.25
 
 
 @pytest.mark.parametrize("scale", [0.0, math.nan, -1.0])

@@ -111,7 +111,7 @@ def test_float32_agrees_with_float64(flume: Scene):
 
 
 @given(st.integers(0, 1000), st.floats(0.02, 0.98))
-@settings(max_examples=20)
+@settings(max_examples=100)
 def test_smooth_quantile_is_a_quantile(seed: int, q: float):
     values = torch.tensor(np.random.default_rng(seed).normal(size=(3, 501)))
     soft = smooth_quantile(values, q, 1e-4)
@@ -121,13 +121,14 @@ def test_smooth_quantile_is_a_quantile(seed: int, q: float):
     share = torch.sigmoid((soft[:, None] - values) / 1e-4).mean(dim=-1)
     torch.testing.assert_close(share, torch.full_like(share, q), atol=2e-3, rtol=0)
     # Shifted and stretched values have a shifted and stretched quantile.
-    again = smooth_quantile(3 * values - 1, q, 3e-4)
-    torch.testing.assert_close(again, 3 * soft - 1)
+    # (Wider: where q falls in a gap of many widths, any s in the gap is a quantile.)
+    wide = smooth_quantile(values, q, 0.05)
+    torch.testing.assert_close(smooth_quantile(3 * values - 1, q, 0.15), 3 * wide - 1)
     # A weight of two is the point twice.
-    twice = smooth_quantile(torch.cat([values, values[:, :9]], dim=1), q, 1e-2)
+    twice = smooth_quantile(torch.cat([values, values[:, :9]], dim=1), q, 0.05)
     weights = torch.ones_like(values)
     weights[:, :9] = 2
-    torch.testing.assert_close(smooth_quantile(values, q, 1e-2, weights=weights), twice)
+    torch.testing.assert_close(smooth_quantile(values, q, 0.05, weights=weights), twice)
 
 
 def test_smooth_quantile_moves_with_all_values():

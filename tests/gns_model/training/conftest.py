@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -53,9 +54,44 @@ def flight(scene: Scene, spacing: float = SPACING, frames: int = 21) -> Trajecto
 
 
 @pytest.fixture(scope="session")
+def free_scene() -> Scene:
+    """A scene without baffles in the way, whose points fly for 0.1 s before any of them lands."""
+    return flying_scene().replace(
+        releases=({"lower": (0.05, 0.4, 0.1), "upper": (0.30, 0.65, 0.35), "velocity": (1, 0, 0)},)
+    )
+
+
+@pytest.fixture(scope="session")
+def free_flight(free_scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of one trajectory in which nothing but gravity acts."""
+    folder = tmp_path_factory.mktemp("free")
+    flight(free_scene, frames=11).save(folder / "free.h5")
+    return folder
+
+
+@pytest.fixture(scope="session")
 def flights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of four trajectories."""
     folder = tmp_path_factory.mktemp("flights")
     for k in range(4):
         flight(flying_scene(0.1 * k, 0.8 + 0.2 * k)).save(folder / f"{k:03}.h5")
     return folder
+
+
+@pytest.fixture(scope="session")
+def tiny(flights: Path) -> dict[str, Any]:
+    """A recipe, as plain values, that trains in a second on `flights`."""
+    return {
+        "name": "tiny",
+        "train": [str(flights)],
+        "valid": [str(flights)],
+        "steps": 6,
+        "edges_per_batch": 800,
+        "statistics_windows": 16,
+        "valid_rollouts": 2,
+        "valid_windows": 4,
+        "unroll": 2,
+        "unroll_fraction": 0.5,
+        "device": "cpu",
+        "model": {"spacing": 0.0625, "dt": 0.02, "radius": 0.1, "latent": 8, "blocks": 2},
+    }

@@ -1,0 +1,303 @@
+"""The searches on a formula: constraints, improvement, resuming, failures, budget."""
+
+import numpy as np
+import pytest
+import torch
+
+from design import bayes, gradient, hybrid
+from design.baselines import engineering_layouts, random_layouts
+from design.gradient import LEAST_STEP, Chain, differentiate
+from design.trials import Outcome, StudyError, TrialLog, sqlite_url, table
+from gns_env.layout import LayoutSpace
+from gns_env.objective import Objective
+from gns_env.task import BaffleTask
+from gns_model.errors import SimulatorError
+
+from .search_kit import FormulaSimulator, PlainFormula, campaign, formula_scene
+
+METHODS = {"bayes": bayes.search, "gradient": gradient.search, "hybrid": hybrid.search}
+#: Two keep-outs, and a gap that rows of three just hold.
+CROWDED = {
+    "placement": {
+        "lower": [0.5, 0.0],
+        "upper": [1.3, 1.6],
+        "gap": 0.12,
+        "keep_out": [[0.8, 0.0, 1.0, 0.7], [0.6, 1.0, 1.1, 1.2]],
+    }
+}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_layout_that_is_run_is_buildable(tmp_path, method):
+    simulator = FormulaSimulator()
+    scene = formula_scene(**CROWDED)
+    c = campaign(tmp_path, simulator=simulator, scene=scene, n=3, budget=36)
+    METHODS[method](c)
+    ran = [s for s in simulator.seen if s.baffles]
+    assert ran or method == "gradient"
+    layouts = [np.array([b.center for b in s.baffles]) for s in ran]
+    layouts += [t.centres for t in c.log.trials()]
+    assert len(layouts) >= 18
+    for layout in layouts:
+        assert layout.shape == (3, 2)
+        assert c.space.check(layout) == []
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_budget_is_spent_and_counted(tmp_path, method):
+    c = campaign(tmp_path, budget=30)
+    seen = []
+    c.on_trial = seen.append
+    METHODS[method](c)
+    trials = c.log.trials()
+    assert 29 <= c.log.spent() <= 30  # a gradient costs two, so one may be left
+    assert len(seen) == len(trials)
+    backwards = sum(t.outcome.backwards for t in trials)
+    assert (backwards > 0) == (method != "bayes")
+    assert sum(t.outcome.rollouts for t in trials) + backwards == c.log.spent()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_search_beats_chance(tmp_path, method):
+    c = campaign(tmp_path, n=2, budget=60, seed=3)
+    METHODS[method](c)
+    task = c.evaluator.task
+    rng = np.random.default_rng(0)
+    by_chance = [
+        min(e.cost for e in task.evaluate([x for _, x in random_layouts(c.space, 60, rng)]))
+        for _ in range(5)
+    ]
+    assert c.log.best().cost < np.median(by_chance)
+
+
+def test_gradients_finish_what_sampling_begins(tmp_path):
+    for name in ("bayes", "hybrid"):
+        (tmp_path / name).mkdir()
+    searches = {name: campaign(tmp_path / name, budget=60) for name in ("bayes", "hybrid")}
+    for name, c in searches.items():
+        METHODS[name](c)
+    best = searches["hybrid"].log.best()
+    assert best.cost <= searches["bayes"].log.best().cost
+    assert best.origin == "gradient"
+
+
+def test_a_resumed_search_is_the_search_that_was_not_interrupted(tmp_path):
+    whole, halves = tmp_path / "whole", tmp_path / "halves"
+    whole.mkdir()
+    halves.mkdir()
+    c = campaign(whole, budget=32, seed=5)
+    bayes.search(c)
+    bayes.search(campaign(halves, budget=16, seed=5))
+    resumed = campaign(halves, budget=32, seed=5, resume=True)
+    assert len(resumed.log.trials()) == 16
+    bayes.search(resumed)
+    costs = [[t.cost for t in s.log.trials()] for s in (c, resumed)]
+    assert len(costs[0]) == 32
+    assert costs[0] == costs[1]
+
+
+def test_another_seed_is_another_search(tmp_path):
+    costs = []
+    for seed in (0, 1):
+        (tmp_path / str(seed)).mkdir()
+        c = campaign(tmp_path / str(seed), budget=16, seed=seed)
+        bayes.search(c)
+        costs.append([t.cost for t in c.log.trials() if t.origin == "bayes"])
+    assert costs[0] != costs[1]
+
+
+def test_failures_are_told_with_a_finite_penalty_and_the_search_goes_on(tmp_path):
+    def left_half(scene):
+        return any(b.center[1] < 0.6 for b in scene.baffles)
+
+    c = campaign(tmp_path, simulator=FormulaSimulator(fails=left_half), n=1, budget=40)
+    hybrid.search(c)
+    trials = c.log.trials()
+    failed = [t for t in trials if not t.ok]
+    assert failed
+    assert {t.outcome.status for t in failed} <= {"diverged"}
+    assert all(np.isfinite(t.cost) and t.outcome.measures == {} for t in failed)
+    assert c.log.best().ok
+    assert min(t.cost for t in failed) > max(t.cost for t in trials if t.ok)
+    # Having learnt where rollouts fail, it goes there less than chance would.
+    late = [t for t in trials[20:] if t.origin == "bayes"]
+    assert sum(not t.ok for t in late) < 0.35 * len(late)
+
+
+def test_a_search_without_any_good_rollout_still_ends(tmp_path):
+    c = campaign(tmp_path, simulator=FormulaSimulator(fails=lambda s: bool(s.baffles)), budget=12)
+    bayes.search(c)
+    assert c.log.spent() == 12
+    assert c.log.best() is None
+
+
+def test_an_interrupt_keeps_what_was_told_and_leaves_nothing_waiting(tmp_path):
+    c = campaign(tmp_path, budget=32)
+    told = []
+
+    def stop(trial):
+        told.append(trial)
+        if len(told) == 11:
+            raise KeyboardInterrupt
+
+    c.on_trial = stop
+    with pytest.raises(KeyboardInterrupt):
+        bayes.search(c)
+    states = [t.state.name for t in c.log.study.get_trials(deepcopy=False)]
+    assert "RUNNING" not in states
+    resumed = campaign(tmp_path, budget=32, resume=True)
+    assert len(resumed.log.trials()) == 11
+    bayes.search(resumed)
+    assert resumed.log.spent() == 32
+
+
+def test_trials_left_running_by_a_crash_are_let_go(tmp_path):
+    c = campaign(tmp_path)
+    c.log.ask(3, bayes.sampler(c))  # and never told
+    resumed = campaign(tmp_path, resume=True)
+    assert {t.state.name for t in resumed.log.study.get_trials()} == {"FAIL"}
+
+
+@pytest.mark.parametrize("search", [gradient.search, hybrid.search])
+def test_a_simulator_without_gradient_is_refused_before_anything_is_spent(tmp_path, search):
+    c = campaign(tmp_path, simulator=PlainFormula())
+    with pytest.raises(SimulatorError, match="no gradient"):
+        search(c)
+    assert c.log.spent() == 0
+
+
+# -- gradient --------------------------------------------------------------------------------------
+
+
+def test_the_gradient_is_that_of_central_differences():
+    task = BaffleTask(formula_scene(), FormulaSimulator(), n_baffles=2)
+    layout = np.array([[0.7, 0.5], [1.2, 1.0]])
+    outcome = differentiate(task, [layout])[0]
+    assert outcome.status == "ok"
+    assert (outcome.rollouts, outcome.backwards) == (1, 1)
+    assert outcome.cost == pytest.approx(task.evaluate([layout])[0].cost)
+    # Travel alone is exact in both; depth is smoothed, and 0 here where no window holds grains.
+    h, numeric = 1e-3, np.zeros_like(layout)
+    travel = BaffleTask(
+        formula_scene(), FormulaSimulator(), n_baffles=2, objective=Objective(depth_weight=0.0)
+    )
+    for index in np.ndindex(layout.shape):
+        step = np.zeros_like(layout)
+        step[index] = h
+        up, down = travel.evaluate([layout + step, layout - step])
+        numeric[index] = (up.cost - down.cost) / (2 * h)
+    np.testing.assert_allclose(differentiate(travel, [layout])[0].gradient, numeric, rtol=2e-3)
+
+
+def test_a_batch_of_gradients_is_the_gradients_one_by_one():
+    task = BaffleTask(formula_scene(), FormulaSimulator(), n_baffles=2)
+    layouts = [np.array([[0.7, 0.5], [1.2, 1.0]]), np.array([[0.8, 0.3], [0.9, 0.8]])]
+    together = differentiate(task, layouts)
+    for layout, outcome in zip(layouts, together, strict=True):
+        alone = differentiate(task, [layout])[0]
+        np.testing.assert_allclose(outcome.gradient, alone.gradient)
+
+
+class _Astray(FormulaSimulator):
+    def rollout_tensor(self, scenes, centres=None, **options):
+        return [p * torch.tensor(float("nan")) for p in super().rollout_tensor(scenes, centres)]
+
+
+def test_a_gradient_of_a_rollout_that_went_astray_is_a_failure(tmp_path):
+    task = BaffleTask(formula_scene(), _Astray(), n_baffles=2)
+    outcome = differentiate(task, [np.array([[0.7, 0.5], [1.2, 1.0]])])[0]
+    assert outcome.status == "diverged"
+    assert np.isfinite(outcome.cost)
+    c = campaign(tmp_path, simulator=_Astray(), budget=24)
+    gradient.search(c)  # ends, although every chain dies at once
+    assert c.log.best().ok
+
+
+def test_a_chain_descends_a_bowl_and_stops_there():
+    space = LayoutSpace(formula_scene(), 1)
+    bottom = np.array([[1.1, 0.9]])
+    chain, steps = Chain(space, np.array([[0.7, 0.4]])), 0
+    while chain.step >= LEAST_STEP and steps < 200:
+        offset = chain.centres - bottom
+        chain.learn(Outcome(float((offset**2).sum()), {}, gradient=2 * offset))
+        steps += 1
+    assert steps < 200
+    np.testing.assert_allclose(chain.centres, bottom, atol=0.02)
+
+
+def test_a_chain_stops_at_a_constraint():
+    space = LayoutSpace(formula_scene(), 1)
+    chain = Chain(space, space.decode(np.array([0.0, 0.5])))
+    chain.learn(Outcome(1.0, {}, gradient=np.array([[1.0, 0.0]])))  # downhill is out of bounds
+    assert chain.step == 0
+
+
+# -- the log ---------------------------------------------------------------------------------------
+
+
+def test_a_study_is_not_started_twice_and_not_mixed_with_another_task(tmp_path):
+    bayes.search(campaign(tmp_path, budget=8))
+    with pytest.raises(StudyError, match="--resume"):
+        campaign(tmp_path)
+    with pytest.raises(StudyError, match="another n"):
+        campaign(tmp_path, n=3, resume=True)
+
+
+@pytest.mark.parametrize(
+    "storage",
+    ["nonsense", "nosuch://x/y", "sqlite:////nosuch/folder/study.db", "postgresql://u:secret@h/d"],
+)
+def test_a_storage_that_cannot_be_opened_is_one_error_without_the_password(storage):
+    space = LayoutSpace(formula_scene(), 2)
+    with pytest.raises(StudyError) as error:
+        TrialLog.open(storage, "x", space, {}, resume=False, owned=False)
+    assert "secret" not in str(error.value)
+
+
+def test_a_file_that_is_not_a_database_is_named(tmp_path):
+    (tmp_path / "study.db").write_text("not a database, " * 100)
+    with pytest.raises(StudyError, match="study.db"):
+        campaign(tmp_path)
+
+
+def test_two_searches_share_a_study(tmp_path):
+    first = campaign(tmp_path, budget=12)
+    second = campaign(tmp_path, budget=24, resume=True)
+    bayes.search(first)
+    bayes.search(second)
+    assert first.log.spent() == second.log.spent() == 24
+
+
+def test_the_table_holds_every_trial(tmp_path):
+    c = campaign(tmp_path, budget=10)
+    bayes.search(c)
+    lines = table(c.log.trials()).splitlines()
+    header = lines[0].split(",")
+    assert len(lines) == 11
+    assert {"number", "origin", "cost", "centroid_travel", "x1", "z1", "x2", "z2"} <= set(header)
+    row = dict(zip(header, lines[3].split(","), strict=True))
+    assert float(row["cost"]) == c.log.trials()[2].cost
+
+
+# -- baselines -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 6])
+def test_engineering_layouts_are_rows_and_buildable(n):
+    space = LayoutSpace(formula_scene(), n)
+    layouts = list(engineering_layouts(space))
+    assert all(space.check(c) == [] and c.shape == (n, 2) for _, c in layouts)
+    single = next(c for name, c in layouts if name == "row")
+    assert np.ptp(single[:, 0]) < 1e-9
+    gaps = np.diff(np.sort(single[:, 1]))
+    assert np.allclose(gaps, gaps[:1])
+    if n >= 2:
+        staggered = next(c for name, c in layouts if name == "staggered")
+        assert len(np.unique(staggered[:, 0].round(6))) == 2
+
+
+def test_a_plane_scene_has_series(plane_scene):
+    space = LayoutSpace(plane_scene, 2)
+    layouts = list(engineering_layouts(space))
+    assert {name for name, _ in layouts} == {"series"}
+    assert all(space.check(c) == [] for _, c in layouts)

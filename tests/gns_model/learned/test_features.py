@@ -1,0 +1,97 @@
+from __future__ import annotations
+
+import numpy as np
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gns_model.learned.features import (
+    baffle_features,
+    edge_features,
+    envelope,
+    fade,
+    signed_distance,
+    wall_features,
+)
+
+BOX = torch.tensor([[[[0.2, 0.0, 0.2], [0.5, 0.4, 0.6]]]], dtype=torch.float64)
+coordinate = st.floats(-0.3, 1.0)
+
+
+def brute_distance(point: np.ndarray) -> float:
+    """Signed distance from definitions: nearest point outside, nearest face inside."""
+    low, high = BOX[0, 0].numpy()
+    nearest = np.clip(point, low, high)
+    outside = float(np.linalg.norm(point - nearest))
+    return outside if outside > 0 else -float(min((point - low).min(), (high - point).min()))
+
+
+@given(st.tuples(coordinate, coordinate, coordinate))
+def test_signed_distance_and_its_gradient(point):
+    p = torch.tensor([point], dtype=torch.float64, requires_grad=True)
+    distance, normal = signed_distance(p, BOX)
+    assert abs(distance.item() - brute_distance(np.array(point))) < 1e-12
+    assert abs(normal.norm().item() - 1) < 1e-9
+    (gradient,) = torch.autograd.grad(distance.sum(), p)
+    # At ties inside and on the faces the derivative of the distance has a choice of faces.
+    beyond = torch.maximum(BOX[0, 0, 0] - p, p - BOX[0, 0, 1])[0].detach().sort().values
+    if beyond[-1] > 1e-6 or (beyond[-1] < -1e-6 and beyond[-1] - beyond[-2] > 1e-6):
+        torch.testing.assert_close(gradient, normal[:, 0].detach(), atol=1e-6, rtol=0)
+
+
+def test_normal_on_a_face_is_that_of_the_face():
+    points = torch.tensor([[0.2, 0.1, 0.4], [0.3, 0.4, 0.3], [0.3, 0.1, 0.6]]).double()
+    distance, normal = signed_distance(points, BOX.expand(3, -1, -1, -1))
+    assert distance.abs().max() == 0
+    assert normal[:, 0].tolist() == [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]
+
+
+def test_everything_fades_with_its_slope():
+    for end, function in ((0.1, lambda x: fade(x, 0.1)), (1.0, envelope)):
+        x = torch.tensor([end - 1e-7, end, end + 1e-7], dtype=torch.float64, requires_grad=True)
+        value = function(x)
+        (slope,) = torch.autograd.grad(value.sum(), x)
+        assert value.abs().max() < 1e-11
+        assert slope.abs().max() < 1e-4
+    assert envelope(torch.tensor(0.0)) == 1
+    assert fade(torch.tensor(0.0), 0.1) == 1
+
+
+def test_baffle_features_end_at_their_range_and_turn_with_the_scene():
+    far = torch.tensor([[0.7, 0.1, 0.4]]).double()
+    velocity = torch.tensor([[1.0, 2.0, 3.0]]).double()
+    assert baffle_features(far, velocity, BOX, 0.2 - 1e-9).abs().max() == 0
+    near = baffle_features(far, velocity, BOX, 0.4)
+    # w = (1 - 0.2/0.4)², normal +x, approach 1
+    torch.testing.assert_close(near, torch.tensor([[0.25, 0.25, 0, 0, 0.25]]).double())
+    mirror = torch.tensor([1.0, 1.0, -1.0]).double()
+    flipped = torch.stack([BOX[..., 0, :], BOX[..., 1, :]], dim=-2) * mirror
+    flipped = torch.stack(
+        [torch.minimum(*flipped.unbind(-2)), torch.maximum(*flipped.unbind(-2))], dim=-2
+    )
+    point = torch.tensor([[0.55, 0.45, 0.65]]).double()
+    one = baffle_features(point, velocity, BOX, 0.3)
+    other = baffle_features(point * mirror, velocity * mirror, flipped, 0.3)
+    torch.testing.assert_close(other, one * torch.tensor([1, 1, 1, -1, 1]).double())
+
+
+def test_wall_features_paper_and_ours():
+    points = torch.tensor([[0.01, 0.5]])
+    lower, upper = torch.zeros(1, 2), torch.ones(1, 2)
+    clipped = wall_features(points, lower, upper, 0.04, clip=True)
+    torch.testing.assert_close(clipped, torch.tensor([[0.25, 1, 1, 1]]))
+    faded = wall_features(points, lower, upper, 0.04, clip=False)
+    torch.testing.assert_close(faded, torch.tensor([[0.5625, 0, 0, 0]]))
+
+
+def test_edge_features_are_receiver_minus_sender_and_differentiable_when_points_coincide():
+    points = torch.tensor([[0.0, 0.0], [0.3, 0.4], [0.3, 0.4]], requires_grad=True)
+    velocity = torch.tensor([[1.0, 0.0], [0.0, 2.0], [0.0, 0.0]])
+    senders, receivers = torch.tensor([0, 1]), torch.tensor([1, 2])
+    feature, norm = edge_features(points, velocity, senders, receivers, 0.5)
+    torch.testing.assert_close(
+        feature, torch.tensor([[0.6, 0.8, 1, -1, 2], [0, 0, 0, 0, -2]]), atol=2e-6, rtol=0
+    )
+    assert edge_features(points, None, senders, receivers, 0.5)[0].shape == (2, 3)
+    norm.sum().backward()
+    assert torch.isfinite(points.grad).all()

@@ -1,0 +1,247 @@
+"""From windows to the loss: mirror, statistics, batches, and the target behind the noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gns_model.data.windows import WindowIndex
+from gns_model.learned.config import ModelConfig
+from gns_model.learned.graph import radius_graph
+from gns_model.learned.model import LearnedModel
+from gns_model.scene import Scene
+from gns_model.training.augment import mirror_positions, mirrored
+from gns_model.training.batches import DRAW, collate, draw, generator, read
+from gns_model.training.loss import step_error, unrolled_loss
+from gns_model.training.statistics import measure
+
+SPACING, DT, RADIUS = 0.0625, 0.02, 0.1
+
+
+def index(folder, unroll=2):
+    return WindowIndex([folder], spacing=SPACING, dt=DT, history=3, unroll=unroll)
+
+
+def statistics(windows, **changes):
+    options = {"windows": 64, "radius": RADIUS, "noise_std": 0.0, "subtract_gravity": True}
+    return measure(windows, **{**options, **changes})
+
+
+def model(**changes) -> LearnedModel:
+    torch.manual_seed(0)
+    config = ModelConfig(spacing=SPACING, dt=DT, radius=RADIUS, latent=8, blocks=2, **changes)
+    return LearnedModel(config)
+
+
+# -- mirror ----------------------------------------------------------------------------------------
+
+
+def placed_scene() -> Scene:
+    return Scene.from_dict(
+        {
+            "domain": {"lower": [0.1, 0.1, 0.2], "upper": [1.9, 0.9, 1.7]},
+            "gravity": [1.0, -9.0, 0.5],
+            "release": [
+                {"lower": [0.1, 0.1, 0.3], "upper": [0.4, 0.3, 1.0], "velocity": [2, 0, 0.3]}
+            ],
+            "baffle": [{"center": [0.8, 0.5], "size": [0.1, 0.3, 0.2]}],
+            "placement": {
+                "lower": [0.6, 0.2],
+                "upper": [1.5, 1.6],
+                "keep_out": [[1.0, 0.2, 1.2, 0.5]],
+            },
+        }
+    )
+
+
+def test_a_mirrored_scene_is_a_scene_and_two_mirrors_undo_each_other():
+    scene = placed_scene()
+    other = mirrored(scene)
+    assert Scene.from_dict(other.to_dict()) == other  # passes every check of a scene
+    assert other.baffles[0].center == pytest.approx((0.8, 1.4))
+    assert other.releases[0].velocity == (2, 0, -0.3)
+    assert other.gravity == (1.0, -9.0, -0.5)
+    back = mirrored(other)
+    np.testing.assert_allclose(back.baffle_boxes(), scene.baffle_boxes(), atol=1e-12)
+    np.testing.assert_allclose(back.releases[0].lower, scene.releases[0].lower, atol=1e-12)
+    np.testing.assert_allclose(back.placement.keep_out, scene.placement.keep_out, atol=1e-12)
+    points = np.random.default_rng(0).uniform(0.3, 0.8, (5, 4, 3)).astype(np.float32)
+    np.testing.assert_allclose(
+        mirror_positions(mirror_positions(points, scene), other), points, atol=1e-6
+    )
+
+
+def test_a_mirror_keeps_distances_to_baffles_and_walls():
+    from gns_model.learned.features import signed_distance
+
+    scene, rng = placed_scene(), np.random.default_rng(0)
+    points = rng.uniform(scene.domain.lower, scene.domain.upper, (50, 3))
+    seen = mirror_positions(points, scene)
+
+    def distances(points, scene):
+        boxes = torch.tensor(scene.baffle_boxes())[None].expand(len(points), -1, -1, -1)
+        return signed_distance(torch.tensor(points), boxes)[0]
+
+    # The mirror plane is rounded to float32, as positions are.
+    torch.testing.assert_close(
+        distances(points, scene), distances(seen, mirrored(scene)), atol=1e-6, rtol=0
+    )
+
+
+# -- statistics ------------------------------------------------------------------------------------
+
+
+def test_statistics_of_free_flight_are_those_of_a_parabola(free_flight):
+    plain = statistics(index(free_flight), subtract_gravity=False)
+    known = statistics(index(free_flight))
+    assert plain.velocity_mean[0] == pytest.approx(1.0, abs=1e-3)
+    assert plain.velocity_mean[2] == plain.acceleration_mean[2] == 0
+    # Windows that begin at t = 0 see half of gravity, since there was none before.
+    assert -9.82 < plain.acceleration_mean[1] < -0.5 * 9.81
+    np.testing.assert_allclose(
+        np.subtract(known.acceleration_mean, plain.acceleration_mean), [0, 9.81, 0], atol=1e-6
+    )
+
+
+def test_noise_widens_the_statistics_as_it_widens_the_data(flights):
+    windows, noise = index(flights), 1e-3
+    plain, noisy = statistics(windows), statistics(windows, noise_std=noise)
+    assert noisy.velocity_std == pytest.approx(np.hypot(plain.velocity_std, noise / DT), rel=1e-3)
+    assert noisy.acceleration_std == pytest.approx(
+        np.hypot(plain.acceleration_std, noise / DT**2), rel=1e-3
+    )
+
+
+# -- batches ---------------------------------------------------------------------------------------
+
+
+def test_draws_are_shared_out_evenly_and_repeat(flights):
+    windows = index(flights)
+    about = statistics(windows)
+
+    def parts(step):
+        return draw(
+            windows,
+            generator(0, DRAW, step),
+            ranks=3,
+            edges_per_batch=4000,
+            statistics=about,
+            mirror=True,
+        )
+
+    assert parts(7) == parts(7)
+    assert parts(7) != parts(8)
+    sizes = np.array([[sum(d.edges for d in part) for part in parts(k)] for k in range(20)])
+    assert sizes.mean() == pytest.approx(4000, rel=0.1)
+    assert (sizes.max(axis=1) / sizes.min(axis=1)).mean() < 1.5
+    flips = [d.mirror for k in range(20) for part in parts(k) for d in part]
+    assert 0.3 < np.mean(flips) < 0.7
+
+
+def test_expected_edges_are_near_the_real_ones(flights):
+    windows = index(flights)
+    about = statistics(windows)
+    parts = draw(
+        windows,
+        np.random.default_rng(0),
+        ranks=1,
+        edges_per_batch=60_000,
+        statistics=about,
+        mirror=False,
+    )
+    real = sum(
+        len(radius_graph(torch.from_numpy(read(windows, d).history[:, -1].copy()), RADIUS)[0])
+        for d in parts[0]
+    )
+    assert real == pytest.approx(sum(d.edges for d in parts[0]), rel=0.1)
+
+
+def test_a_rank_gets_a_window_even_if_it_is_too_large(flights):
+    windows = index(flights)
+    parts = draw(
+        windows,
+        np.random.default_rng(0),
+        ranks=4,
+        edges_per_batch=1,
+        statistics=statistics(windows),
+        mirror=False,
+    )
+    assert [len(part) for part in parts] == [1] * 4
+
+
+# -- loss ------------------------------------------------------------------------------------------
+
+
+def ballistic(folder, noise_std=0.0, unroll=3):
+    """A model that predicts a = g, and a batch of free flight whose last velocity knows gravity."""
+    net = model(noise_std=noise_std)
+    with torch.no_grad():
+        for p in net.network.decode.parameters():
+            p.zero_()
+    windows = index(folder, unroll)
+    batch = collate(
+        [windows.read(0, frame) for frame in (2, 3, 4)],
+        noise_std=noise_std,
+        rng=np.random.default_rng(0),
+        device=torch.device("cpu"),
+    )
+    return net, batch
+
+
+@pytest.mark.parametrize("backprop", [False, True])
+@pytest.mark.parametrize("steps", [1, 3])
+def test_free_flight_costs_nothing_when_gravity_is_known(free_flight, steps, backprop):
+    net, batch = ballistic(free_flight)
+    with torch.no_grad():
+        loss = unrolled_loss(net, batch, steps=steps, backprop=backprop)
+        # What float32 positions leave of an acceleration of 9.81 m/s² is below 0.01 m/s².
+        assert float(loss) < 1e-4
+        net.acceleration_mean[1] = 1.0
+        assert float(unrolled_loss(net, batch, steps=steps, backprop=backprop)) > 0.3
+
+
+def test_the_target_is_corrected_for_the_noise(free_flight):
+    """A step that reproduces the true displacement costs nothing whatever the noise, and a model
+    that trusts the noisy velocity is wrong by exactly the noise of that velocity."""
+    noise_std = 1e-3
+    net, noisy = ballistic(free_flight, noise_std)
+    _, clean = ballistic(free_flight)
+    torch.testing.assert_close(noisy.moves, clean.moves)
+    after = noisy.history[:, -1] + noisy.moves[:, 0]
+    assert float(step_error(net, noisy.history, after, noisy.moves[:, 0])) < 1e-4
+    history = noisy.history
+    gravity = torch.tensor([0, -9.81, 0]) * DT**2
+    trusting = history[:, -1] + (history[:, -1] - history[:, -2]) + gravity
+    found = float(step_error(net, history, trusting, noisy.moves[:, 0]))
+    assert found == pytest.approx((noise_std / DT**2) ** 2, rel=0.25)
+
+
+def test_push_forward_and_backprop_agree_on_one_step_only(flights):
+    windows = index(flights)
+    net = model()
+    statistics(windows).apply(net)
+    rng = np.random.default_rng(0)
+    batch = collate([windows.read(0, 3)], noise_std=0.0, rng=rng, device=torch.device("cpu"))
+
+    def gradient(steps, backprop):
+        net.zero_grad()
+        unrolled_loss(net, batch, steps=steps, backprop=backprop).backward()
+        return torch.cat([p.grad.flatten() for p in net.parameters() if p.grad is not None])
+
+    torch.testing.assert_close(gradient(1, False), gradient(1, True))
+    assert not torch.allclose(gradient(2, False), gradient(2, True), rtol=1e-2)
+
+
+def test_the_loss_turns_linear_where_asked(free_flight):
+    net, batch = ballistic(free_flight)
+    history, move = batch.history, batch.moves[:, 0]
+    scale = DT**2 * net.acceleration_std
+
+    def cost(error, beyond):
+        after = history[:, -1] + move + error * scale
+        return float(step_error(net, history, after, move, linear_beyond=beyond))
+
+    assert cost(1.0, None) == pytest.approx(1.0, rel=1e-2)
+    assert cost(0.5, 10.0) == pytest.approx(0.25, rel=1e-2)
+    assert cost(100.0, 2.0) == pytest.approx(2 * 4 * ((1 + 2500) ** 0.5 - 1), rel=1e-2)

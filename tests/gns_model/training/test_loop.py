@@ -1,0 +1,217 @@
+"""Training as a whole: it learns, resumes bit for bit, alone and on two ranks, and stops well."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from gns_model.learned.checkpoint import load_model
+from gns_model.training import Recipe, RecipeError, TrainingError, launch, train
+from gns_model.training.progress import Display
+from gns_model.training.state import read_position
+from gns_model.trajectory import Trajectory
+
+ROOT = Path(__file__).parents[3]
+
+
+def write_recipe(path: Path, values: dict) -> Path:
+    lines = [f"{k} = {json.dumps(v)}" for k, v in values.items() if k != "model"]
+    lines += ["[model]", *(f"{k} = {json.dumps(v)}" for k, v in values["model"].items())]
+    path.write_text("\n".join(lines))
+    return path
+
+
+def same_state(a: Path, b: Path) -> bool:
+    """Whether weights, moving average and moments agree bit for bit."""
+    one, two = load_file(a / "state.safetensors"), load_file(b / "state.safetensors")
+    assert one.keys() == two.keys()
+    assert any(key.startswith("optimiser.") for key in one)
+    return all(torch.equal(one[key], two[key]) for key in one)
+
+
+def test_a_run_leaves_a_simulator_that_runs(tiny, tmp_path, flights):
+    folder = train(Recipe.from_dict(tiny), tmp_path / "run")
+    assert folder == tmp_path / "run" / "model"
+    names = {p.name for p in (tmp_path / "run").iterdir()}
+    assert names == {
+        "model", "last", "state.safetensors", "recipe.json",
+        "log.csv", "validation.csv", "loss.png",
+    }  # fmt: skip
+    simulator = load_model(folder)
+    card = simulator.card
+    assert card["trained_on"]["steps"] == 6
+    assert card["validation"]["score"] > 0
+    assert simulator.config.limits.max_speed == pytest.approx((1.4**2 + 0.05) ** 0.5)
+    truth = Trajectory.load(flights / "000.h5")
+    result = simulator.rollout([truth.scene])[0]
+    assert result.positions.shape == (11, 64, 3)
+    # The saved weights are the moving average, not the last ones.
+    state = load_file(tmp_path / "run" / "state.safetensors")
+    last = load_model(tmp_path / "run" / "last").model.state_dict()
+    key = "network.decode.layers.0.weight"
+    assert torch.equal(last[key], state[f"average.{key}"])
+    assert not torch.equal(last[key], state[f"model.{key}"])
+
+
+def test_training_learns_to_land(tiny, tmp_path):
+    """Grains that stop at the floor: some hundred steps later rollouts end near the truth."""
+
+    def last_validation(steps: int) -> dict[str, float]:
+        values = {**tiny, "steps": steps, "unroll_fraction": 0.2, "validate_minutes": 0.02}
+        train(Recipe.from_dict(values), tmp_path / str(steps))
+        with (tmp_path / str(steps) / "validation.csv").open() as file:
+            checks = [{k: float(v) for k, v in row.items()} for row in csv.DictReader(file)]
+        best = json.loads((tmp_path / str(steps) / "model" / "card.json").read_text())
+        lowest = min(row["score"] for row in checks)
+        assert best["validation"]["score"] == pytest.approx(lowest, rel=1e-5)
+        return checks[-1]
+
+    untrained, trained = last_validation(1), last_validation(250)
+    assert trained["centroid_travel"] < 0.1 < untrained["centroid_travel"]
+    assert trained["score"] < 0.5 * untrained["score"]
+    assert trained["one_step"] < untrained["one_step"]
+    assert trained["diverged"] == 0
+
+
+def test_resume_is_bit_exact_after_a_signal(tiny, tmp_path, monkeypatch):
+    """Six steps at once, and three, SIGTERM, three: the same weights, average and moments."""
+    recipe = Recipe.from_dict(tiny)
+    train(recipe, tmp_path / "whole")
+
+    step = Display.step
+
+    def step_and_kill(self, number, *rest):
+        step(self, number, *rest)
+        if number == 2:  # noticed in step 3
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Display, "step", step_and_kill)
+        train(recipe, tmp_path / "parts")
+    assert read_position(tmp_path / "parts" / "state.safetensors").step == 3
+    assert not same_state(tmp_path / "whole", tmp_path / "parts")
+    assert signal.getsignal(signal.SIGTERM) != signal.SIG_IGN
+    train(recipe, tmp_path / "parts")
+    assert read_position(tmp_path / "parts" / "state.safetensors").step == 6
+    assert same_state(tmp_path / "whole", tmp_path / "parts")
+
+
+def test_starting_anew_forgets_the_state(tiny, tmp_path):
+    recipe = Recipe.from_dict({**tiny, "valid": []})
+    assert train(recipe, tmp_path / "a") == tmp_path / "a" / "last"
+    train(recipe, tmp_path / "b")
+    train(recipe.model_copy(update={"steps": 3}), tmp_path / "a", resume=False)
+    assert read_position(tmp_path / "a" / "state.safetensors").step == 3
+    train(recipe, tmp_path / "a", resume=False)
+    assert same_state(tmp_path / "a", tmp_path / "b")
+
+
+def test_a_finished_run_is_left_as_it_is(tiny, tmp_path):
+    recipe = Recipe.from_dict(tiny)
+    train(recipe, tmp_path / "run")
+    before = (tmp_path / "run" / "model" / "model.safetensors").read_bytes()
+    assert train(recipe, tmp_path / "run") == tmp_path / "run" / "model"
+    assert (tmp_path / "run" / "model" / "model.safetensors").read_bytes() == before
+    assert read_position(tmp_path / "run" / "state.safetensors").step == 6
+
+
+@pytest.mark.parametrize(
+    "change", [{"seed": 1}, {"model": {"radius": 0.11}}, {"model": {"latent": 16}}]
+)
+def test_a_state_of_another_run_is_refused(tiny, tmp_path, change):
+    train(Recipe.from_dict({**tiny, "valid": [], "steps": 1}), tmp_path)
+    values = {**tiny, **change, "model": {**tiny["model"], **change.get("model", {})}}
+    with pytest.raises(RecipeError, match="cannot resume"):
+        train(Recipe.from_dict(values), tmp_path)
+
+
+def test_a_loss_that_is_not_finite_ends_the_run(tiny, tmp_path):
+    recipe = Recipe.from_dict({**tiny, "valid": [], "steps": 100})
+    train(recipe.model_copy(update={"steps": 2}), tmp_path)
+    state = load_file(tmp_path / "state.safetensors")
+    from safetensors import safe_open
+    from safetensors.torch import save_file
+
+    with safe_open(tmp_path / "state.safetensors", framework="pt") as file:
+        metadata = file.metadata()
+    state["model.network.decode.layers.0.bias"][0] = float("nan")
+    save_file(state, tmp_path / "state.safetensors", metadata=metadata)
+    with pytest.raises(TrainingError, match="not finite"):
+        train(recipe, tmp_path)
+
+
+@pytest.mark.parametrize("options", [{"precision": "bfloat16"}, {"backprop_through_unroll": True}])
+def test_other_ways_to_train_run(tiny, tmp_path, options):
+    recipe = Recipe.from_dict({**tiny, **options, "unroll_fraction": 1.0, "linear_beyond": 2.0})
+    train(recipe, tmp_path)
+    with (tmp_path / "log.csv").open() as file:
+        assert all(float(row["loss"]) < 20 for row in csv.DictReader(file))
+
+
+@pytest.mark.slow
+def test_two_ranks_resume_bit_exactly_and_average_their_gradients(tiny, tmp_path):
+    values = {**tiny, "schedule": "exponential", "unroll_fraction": 0.0}
+    whole = write_recipe(tmp_path / "whole.toml", values)
+    half = write_recipe(tmp_path / "half.toml", {**values, "steps": 3})
+    assert launch(whole, tmp_path / "whole", 2) == 0
+    assert launch(half, tmp_path / "parts", 2) == 0
+    assert launch(whole, tmp_path / "parts", 2) == 0
+    assert same_state(tmp_path / "whole", tmp_path / "parts")
+    # One rank sees other batches and so ends elsewhere.
+    assert launch(whole, tmp_path / "alone", 1) == 0
+    assert not same_state(tmp_path / "whole", tmp_path / "alone")
+
+
+@pytest.mark.slow
+def test_sigterm_to_the_launcher_saves_and_ends(tiny, tmp_path):
+    values = {k: v for k, v in tiny.items() if k != "steps"} | {"minutes": 5}
+    recipe = write_recipe(tmp_path / "long.toml", values)
+    call = f"launch({str(recipe)!r}, {str(tmp_path / 'run')!r}, 2)"
+    code = f"from gns_model.training import launch; raise SystemExit({call})"
+    process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT)
+    try:
+        deadline = time.monotonic() + 60
+        while not (tmp_path / "run" / "recipe.json").exists() and time.monotonic() < deadline:
+            time.sleep(0.2)
+        time.sleep(2)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 0
+    finally:
+        process.kill()
+    position = read_position(tmp_path / "run" / "state.safetensors")
+    assert position.step > 0
+    assert position.seconds < 120
+
+
+@pytest.mark.parametrize(
+    ("recipe", "words"),
+    [
+        ('train = ["nowhere"]\nsteps = 1', "nowhere: no trajectory files"),
+        ("steps = 1", "'train' is missing"),
+        (None, "cannot be read"),
+    ],
+)
+def test_the_command_ends_in_one_line_and_code_2(tmp_path, recipe, words):
+    path = tmp_path / "r.toml"
+    if recipe is not None:
+        path.write_text(recipe)
+    result = subprocess.run(
+        [sys.executable, "-m", "gns_model.training", str(path), "--out", str(tmp_path / "o")],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        check=False,
+    )
+    assert result.returncode == 2
+    assert words in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
