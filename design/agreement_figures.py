@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 
 from design import views, wording
@@ -31,8 +32,7 @@ def agreement(run: RunResults, theme: Theme) -> Figure | None:
     designs = list(run.compared())
     if not designs:
         return None
-    figure = Figure(figsize=(WIDTH, 3.15), layout="constrained")
-    figure.get_layout_engine().set(h_pad=0.08)
+    figure = Figure(figsize=(WIDTH, 3.15), layout=ConstrainedLayoutEngine(h_pad=0.08))
     known = {q.name: q for q in wording.quantities(run.scene)}
     panels = figure.subplots(1, len(COMPARED))
     for axes, (name, short) in zip(panels, COMPARED.items(), strict=True):
@@ -53,19 +53,32 @@ def agreement(run: RunResults, theme: Theme) -> Figure | None:
         ends = np.array([low, high])
         axes.fill_between(ends, 0.95 * ends, 1.05 * ends, color=theme.line, alpha=0.55, lw=0)
         for design, solver, learned in pairs:
-            axes.plot(solver, learned, "o", ms=7, color=layout_colour(theme, design.key),
-                      mec=theme.paper, mew=0.8, zorder=4)
+            axes.plot(
+                solver,
+                learned,
+                "o",
+                ms=7,
+                color=layout_colour(theme, design.key),
+                mec=theme.paper,
+                mew=0.8,
+                zorder=4,
+            )
         gap = np.mean([abs(wording.relative(p, s) or 0.0) for _, s, p in pairs])
-        axes.set(xlim=(low, high), ylim=(low, high), aspect="equal",
-                 xlabel=f"solver [{quantity.unit}]")
+        axes.set(
+            xlim=(low, high), ylim=(low, high), aspect="equal", xlabel=f"solver [{quantity.unit}]"
+        )
         axes.set_title(f"{short}  ±{100 * gap:.1f} %")
         axes.locator_params(nbins=4)
         if axes is panels[0]:
             axes.set_ylabel(run.searcher)
     handles = [
         Line2D([], [], marker="o", ls="", color=layout_colour(theme, key), ms=6, label=label)
-        for key, label in (("best", "Best found"), ("rank-2", "Other ranked layouts"),
-                           ("paper", "Scene's own layout"), ("none", "No baffles"))
+        for key, label in (
+            ("best", "Best found"),
+            ("rank-2", "Other ranked layouts"),
+            ("paper", "Scene's own layout"),
+            ("none", "No baffles"),
+        )
         if any(d.key == key for d in designs)
     ]
     figure.legend(handles=handles, ncols=4, loc="outside lower center")
@@ -92,8 +105,15 @@ def deposit(run: RunResults, theme: Theme) -> Figure | None:
             nx, nz = drawn.values.shape
             x = left + (np.arange(nx) + 0.5) * (right - left) / nx
             z = bottom + (np.arange(nz) + 0.5) * (top - bottom) / nz
-            plan.contour(x, z, drawn.values.T, levels=LEVELS, colors=colour,
-                         linestyles=[style], linewidths=width)
+            plan.contour(
+                x,
+                z,
+                drawn.values.T,
+                levels=LEVELS,
+                colors=colour,
+                linestyles=[style],
+                linewidths=width,
+            )
         views.draw_plan(plan, scene, theme, theme.muted)
         plan.set_title("Depth contours at 1, 4 and 8 cm")
         plan.set(xlabel="x [m]", ylabel="z [m]")
@@ -116,8 +136,11 @@ def _profiles(axes: Axes, solver: Trajectory, learned: Trajectory, theme: Theme)
         if flow is solver:
             axes.fill_between(x, depth, color=theme.sand[1], alpha=0.35, lw=0)
     axes.axvline(solver.scene.control_section, color=theme.muted, lw=0.8, ls=(0, (1, 2)))
-    axes.set(xlabel="x [m]", ylabel="depth, mean over the width [m]",
-             xlim=(solver.scene.domain.lower[0], solver.scene.domain.upper[0]))
+    axes.set(
+        xlabel="x [m]",
+        ylabel="depth, mean over the width [m]",
+        xlim=(solver.scene.domain.lower[0], solver.scene.domain.upper[0]),
+    )
     axes.set_ylim(bottom=0)
     axes.set_title("Deposit along the channel")
 

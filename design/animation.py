@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.text import Text
 from PIL import Image
 
@@ -91,11 +92,11 @@ def _stage(
     # Title, note and tick labels need a fixed height; the views scale with the column.
     figure = Figure(
         figsize=(column * len(flows), 0.88 * column * sum(ratios) / length + 1.35),
-        layout="constrained",
+        layout=ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.05, wspace=0.0, hspace=0.0),
     )
-    figure.get_layout_engine().set(w_pad=0.08, h_pad=0.05, wspace=0.0, hspace=0.0)
-    grid = figure.subplots(len(ratios), len(flows), height_ratios=ratios, squeeze=False,
-                           sharex=True)
+    grid = figure.subplots(
+        len(ratios), len(flows), height_ratios=ratios, squeeze=False, sharex=True
+    )
     panels = []
     for number, (column_axes, (design, flow)) in enumerate(zip(grid.T, flows, strict=True)):
         colour = layout_colour(theme, design.key)
@@ -143,7 +144,12 @@ def _gif(pictures: list[Image.Image]) -> bytes:
     durations = [FRAME_MS] * (len(frames) - 1) + [HOLD_MS]
     content = io.BytesIO()
     frames[0].save(
-        content, "GIF", save_all=True, append_images=frames[1:], duration=durations, loop=0,
+        content,
+        "GIF",
+        save_all=True,
+        append_images=frames[1:],
+        duration=durations,
+        loop=0,
         optimize=False,
     )
     return content.getvalue()

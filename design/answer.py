@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from html import escape
 
-import numpy as np
-
 from design import page, wording
-from design.drawing import layout_drawing
+from design.drawing import coordinates, layout_drawing, legend
 from design.results import Design, RunResults
-from gns_model.scene import Scene
 
 #: The measures that stand on the tiles beside the answer.
 HEADLINE = ("centroid_travel", "upstream_depth", "runout_p99", "mass_past_section")
@@ -36,9 +33,9 @@ def answer(run: RunResults, name: str) -> str:
         own = run.scene if run.scene.baffles else None
         drawing = layout_drawing(run.scene, placed, own)
         parts.append(
-            f'<div class="answer"><div class="card">{drawing}{_legend(run.scene)}</div>'
+            f'<div class="answer"><div class="card">{drawing}{legend(run.scene)}</div>'
             f'<div class="stack"><div class="card"><h3>Where the baffles go</h3>'
-            f"{_coordinates(run, placed)}</div>{_tiles(run, best)}</div></div>"
+            f"{coordinates(run, placed)}</div>{_tiles(run, best)}</div></div>"
         )
     return "".join(parts)
 
@@ -83,9 +80,10 @@ def _headline(run: RunResults, best: Design, count: int) -> tuple[str, str]:
     if verified and own is not None and _judgement(best, own) in ("worse", "same"):
         title = "The search found nothing better than the scene's own layout"
     elif from_none is not None and wording.verdict(from_none, -1) == "better":
-        title = f"{baffles} that stop the flow {wording.share(from_none)} shorter"
+        stop = f"stop{'s' if count == 1 else ''}" if verified else "should stop"
+        title = f"{baffles} that {stop} the flow {wording.share(from_none)} shorter"
     elif from_none is not None:
-        title = f"{baffles} that do not shorten this flow"
+        title = f"{baffles} that {'does' if count == 1 else 'do'} not shorten this flow"
     else:
         title = f"Where to put {baffles.lower()}"
     sentences = [
@@ -136,57 +134,6 @@ def _judgement(design: Design, other: Design | None) -> str:
     return wording.verdict(wording.relative(mine, theirs), -1)
 
 
-def _coordinates(run: RunResults, placed: Scene) -> str:
-    plane = placed.dim == 2
-    head = ["", "x [m]"] if plane else ["", "x [m]", "z [m]"]
-    rows = [
-        [f'<span class="key">{k}</span>', *(f"{c:.3f}" for c in baffle.center)]
-        for k, baffle in enumerate(placed.baffles, start=1)
-    ]
-    size = placed.baffles[0].size
-    text = f"{size[0]:g} m along x, {size[1]:g} m high" + (
-        "" if plane else f", {size[2]:g} m across"
-    )
-    volume = float(np.prod([b.size for b in placed.baffles], axis=1).sum())
-    unit = "m² (per metre of width)" if plane else "m³"
-    gaps = _least_gap(placed)
-    clear = f"<br>Least clear distance between two: {gaps:.3f} m." if gaps is not None else ""
-    return (
-        f"{page.table(head, rows)}<p class='fine'>"
-        f"Each {text}. Volume in all {volume:.3g} {unit}.{clear}<br>As files: {_links(run)}.</p>"
-    )
-
-
-def _links(run: RunResults) -> str:
-    names = [f"layouts/best.{kind}" for kind in ("toml", "stl", "glb")]
-    there = [name for name in names if (run.folder / name).is_file()]
-    return ", ".join(f'<a href="{name}">{name}</a>' for name in there) or "none yet"
-
-
-def _least_gap(scene: Scene) -> float | None:
-    """Smallest clear distance between two footprints [m]."""
-    plan = scene.baffle_boxes()[:, :, [0, *range(2, scene.dim)]]
-    gaps = [
-        float(np.linalg.norm(np.maximum(np.maximum(a[0] - b[1], b[0] - a[1]), 0)))
-        for k, a in enumerate(plan)
-        for b in plan[:k]
-    ]
-    return min(gaps) if gaps else None
-
-
-def _legend(scene: Scene) -> str:
-    items = [("best", "best found"), ("sand", "release")]
-    if scene.baffles:
-        items.insert(1, ("own", "scene's own layout"))
-    if scene.placement is not None:
-        items.append(("area", "where baffles may stand"))
-    return (
-        '<div class="legend">'
-        + "".join(f'<span><i class="dot {c}"></i>{escape(t)}</span>' for c, t in items)
-        + "</div>"
-    )
-
-
 def _missing(run: RunResults) -> str:
     """What a reader would look for in vain, and why."""
     lacks = []
@@ -197,12 +144,14 @@ def _missing(run: RunResults) -> str:
         lacks.append("The run was interrupted or is under way: this is what it has so far.")
     if best is not None and not best.verified and not best.status:
         lacks.append("The best layout has not been run on the reference solver.")
-    for key, what in (("none", "no baffles"), ("paper", "the scene's own layout")):
+    for key, what in (("none", "the flow without baffles"), ("paper", "the scene's own layout")):
         expected = key == "none" or (run.scene is not None and bool(run.scene.baffles))
         design = run.design(key)
         if expected and (design is None or not design.verified):
-            lacks.append(f"The reference solver has not run {what}, so there is no verified "
-                         "comparison with it.")
+            lacks.append(
+                f"The reference solver has not run {what}, so there is no verified "
+                "comparison with it."
+            )
     if not run.trials:
         lacks.append("There is no table of trials.")
     lacks += run.problems
@@ -244,15 +193,19 @@ def gains(run: RunResults) -> str:
             + [f"<b>{q.text(value)}</b>"]
             + [_changed(wording.relative(value, reference), q) for reference in references]
         )
-    head = ["", *(escape(d.label) for d in others), '<i class="dot best"></i>Best found',
-            *(f"against<br>{escape(d.label.lower())}" for d in others)]
+    head = [
+        "",
+        *(escape(d.label) for d in others),
+        '<i class="dot best"></i>Best found',
+        *(f"against<br>{escape(d.label.lower())}" for d in others),
+    ]
     by = (
         "Every number in this section is by the reference solver, not by the simulator that "
         "the search looked through."
         if verified
         else f"<b>Not verified:</b> every number in this section is by the {run.searcher}."
     )
-    cost = _cost_line(best, others, verified)
+    cost = _cost_line(run, best, others, verified)
     return page.section(
         "What it gains",
         f'<div class="card">{page.table(head, rows)}</div>',
@@ -296,7 +249,7 @@ def _changed(share: float | None, quantity: wording.Quantity) -> str:
     return f'<span class="change {kind or "same"}">{wording.percent(share)}{word}</span>'
 
 
-def _cost_line(best: Design, others: list[Design], verified: bool) -> str:
+def _cost_line(run: RunResults, best: Design, others: list[Design], verified: bool) -> str:
     def cost(design: Design) -> float | None:
         return design.verified_cost if verified else design.cost
 
@@ -304,7 +257,11 @@ def _cost_line(best: Design, others: list[Design], verified: bool) -> str:
     if len(known) < 2:
         return ""
     text = ", ".join(f"{escape(label)} {value:.4f}" for label, value in known)
-    return f"Objective: {text}; less is better."
+    settings = run.summary.get("settings")
+    objective = settings.get("objective") if isinstance(settings, dict) else None
+    meaning = objective.get("text") if isinstance(objective, dict) else None
+    meant = f" ({escape(str(meaning))})" if meaning else ""
+    return f"Objective{meant}: {text}; less is better."
 
 
 def _total_seconds(run: RunResults) -> float | None:

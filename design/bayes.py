@@ -19,8 +19,13 @@ from design.campaign import Campaign
 from design.parameters import to_centres, to_parameters
 from design.trials import TrialLog
 
-#: Random buildable layouts, beside the baselines, before the model takes over.
+#: Trials, baselines included, before the model takes over.
 LEAST_STARTUP = 10
+#: Up to here a Gaussian process proposes, beyond it TPE. On the flume (three baffles, coarse
+#: MPM, three seeds, baselines the same) the best cost after 32 and 64 rollouts was 1.031 and 1.030
+#: with the process, 1.06 and 1.04 with TPE, 1.072 and 1.072 by chance. A proposal takes 0.3 to 1 s
+#: of CPU, growing with the number of trials, against 0.02 s with TPE.
+MOST_PROCESS_TRIALS = 150
 
 
 def search(campaign: Campaign, until: int | None = None) -> None:
@@ -40,20 +45,21 @@ def enqueue_baselines(campaign: Campaign) -> None:
 def sampler(campaign: Campaign) -> optuna.samplers.BaseSampler:
     """The sampler of the next batch. Made anew for each, so that resuming changes nothing."""
     rng = campaign.rng()
+    seed = int(rng.integers(2**31))
+    startup = max(LEAST_STARTUP, 2 * campaign.space.dim)
+    model: optuna.samplers.BaseSampler
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-        model = optuna.samplers.TPESampler(
-            multivariate=True,
-            constant_liar=True,
-            n_startup_trials=startup(campaign),
-            seed=int(rng.integers(2**31)),
-        )
+        if len(campaign.log.trials()) <= MOST_PROCESS_TRIALS:
+            # Simulators repeat themselves exactly.
+            model = optuna.samplers.GPSampler(
+                n_startup_trials=startup, seed=seed, deterministic_objective=True
+            )
+        else:
+            model = optuna.samplers.TPESampler(
+                multivariate=True, constant_liar=True, n_startup_trials=startup, seed=seed
+            )
     return BuildableSampler(model, campaign.log, rng)
-
-
-def startup(campaign: Campaign) -> int:
-    """Trials before the model takes over."""
-    return max(LEAST_STARTUP, 2 * campaign.space.dim)
 
 
 class BuildableSampler(optuna.samplers.BaseSampler):
@@ -70,7 +76,7 @@ class BuildableSampler(optuna.samplers.BaseSampler):
         self, study: optuna.Study, trial: FrozenTrial
     ) -> dict[str, BaseDistribution]:
         """All parameters, also in a study without trials."""
-        # TPE remembers the space it inferred, so it has to be asked although its answer is not
+        # A sampler may remember what it inferred, so it is asked although its answer is not
         # needed: the space here is the same for every trial.
         self._model.infer_relative_search_space(study, trial)
         return dict(self._log.distributions)

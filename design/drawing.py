@@ -1,4 +1,4 @@
-"""A layout as an SVG drawing for the page: plan in 3D, elevation in 2D; the page colours it."""
+"""A layout on the page: an SVG drawing, plan in 3D and elevation in 2D, and its coordinates."""
 
 from __future__ import annotations
 
@@ -7,10 +7,16 @@ from html import escape
 
 import numpy as np
 
+from design import page
+from design.results import RunResults
 from gns_model.scene import Scene
 
 #: Pixels of the drawing's longer side, and room for the ticks around it.
 LONG, LEFT, BOTTOM, TOP, RIGHT = 520.0, 46.0, 40.0, 22.0, 14.0
+
+
+#: Two coordinates in metres.
+Plane = Sequence[float] | np.ndarray
 
 
 class Paper:
@@ -25,7 +31,7 @@ class Paper:
         self.scale = long / float((self.high - self.low).max())
         self.width, self.height = (self.high - self.low) * self.scale
 
-    def rectangle(self, low: Sequence[float], high: Sequence[float], attributes: str) -> str:
+    def rectangle(self, low: Plane, high: Plane, attributes: str) -> str:
         """An SVG rectangle between two corners given in metres, already in the two axes shown."""
         x, y = (low[0] - self.low[0]) * self.scale, (self.high[1] - high[1]) * self.scale
         width, height = (high[0] - low[0]) * self.scale, (high[1] - low[1]) * self.scale
@@ -34,7 +40,7 @@ class Paper:
             f"{attributes}/>"
         )
 
-    def at(self, point: Sequence[float]) -> tuple[float, float]:
+    def at(self, point: Plane) -> tuple[float, float]:
         """Pixels of a point in metres."""
         return (point[0] - self.low[0]) * self.scale, (self.high[1] - point[1]) * self.scale
 
@@ -85,6 +91,59 @@ def thumbnail(scene: Scene, layout: Scene, kind: str) -> str:
     return (
         f'<svg class="thumb" viewBox="-1 -1 {paper.width + 2:.0f} {paper.height + 2:.0f}" '
         f'aria-hidden="true">{"".join(parts)}</svg>'
+    )
+
+
+def coordinates(run: RunResults, placed: Scene) -> str:
+    """The centres of the baffles of `placed` as a table, with their size and files."""
+    plane = placed.dim == 2
+    head = ["", "x [m]"] if plane else ["", "x [m]", "z [m]"]
+    rows = [
+        [f'<span class="key">{k}</span>', *(f"{c:.3f}" for c in baffle.center)]
+        for k, baffle in enumerate(placed.baffles, start=1)
+    ]
+    size = placed.baffles[0].size
+    text = f"{size[0]:g} m along x, {size[1]:g} m high" + (
+        "" if plane else f", {size[2]:g} m across"
+    )
+    volume = float(np.prod([b.size for b in placed.baffles], axis=1).sum())
+    unit = "m² (per metre of width)" if plane else "m³"
+    gaps = _least_gap(placed)
+    clear = f"<br>Least clear distance between two: {gaps:.3f} m." if gaps is not None else ""
+    return (
+        f"{page.table(head, rows)}<p class='fine'>"
+        f"Each {text}. Volume in all {volume:.3g} {unit}.{clear}<br>As files: {_links(run)}.</p>"
+    )
+
+
+def _links(run: RunResults) -> str:
+    names = [f"layouts/best.{kind}" for kind in ("toml", "stl", "glb")]
+    there = [name for name in names if (run.folder / name).is_file()]
+    return ", ".join(f'<a href="{name}">{name}</a>' for name in there) or "none yet"
+
+
+def _least_gap(scene: Scene) -> float | None:
+    """Smallest clear distance between two footprints [m]."""
+    plan = scene.baffle_boxes()[:, :, [0, *range(2, scene.dim)]]
+    gaps = [
+        float(np.linalg.norm(np.maximum(np.maximum(a[0] - b[1], b[0] - a[1]), 0)))
+        for k, a in enumerate(plan)
+        for b in plan[:k]
+    ]
+    return min(gaps) if gaps else None
+
+
+def legend(scene: Scene) -> str:
+    """What the colours of `layout_drawing` mean."""
+    items = [("best", "best found"), ("sand", "release")]
+    if scene.baffles:
+        items.insert(1, ("own", "scene's own layout"))
+    if scene.placement is not None:
+        items.append(("area", "where baffles may stand"))
+    return (
+        '<div class="legend">'
+        + "".join(f'<span><i class="dot {c}"></i>{escape(t)}</span>' for c, t in items)
+        + "</div>"
     )
 
 

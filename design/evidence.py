@@ -29,10 +29,14 @@ def flow(run: RunResults, pictures: Pictures) -> str:
     gif = run.folder / "flow.gif"
     if gif.is_file():
         slower = animation.slow_motion(shown.flows[0][1])
-        above = "Above: depth in plan; below, from the side:" if "plan" in pictures else "Colour:"
+        colours = (
+            "Above: depth in plan; below, from the side: share of the width that is filled."
+            if shown.flows[0][1].scene.dim == 3
+            else "Colour: packing."
+        )
         caption = (
-            f"By the {shown.by}, {slower:.0f} times slower than life. {above} share of the width "
-            "that is filled. Dotted: control section."
+            f"By the {shown.by}, {slower:.0f} times slower than life. {colours} Dotted: control "
+            "section."
         )
         if gif.stat().st_size <= MOST_EMBEDDED:
             parts.append(page.film(gif.read_bytes(), "Animation of the flow", caption))
@@ -74,16 +78,26 @@ def trust(run: RunResults, pictures: Pictures) -> str:
         of_best = mine[0] if mine else (None, None)
         rows.append(
             [
-                f'<span class="key">{escape(q.title)}</span>', q.text(of_best[0]),
-                q.text(of_best[1]), wording.percent(wording.relative(*of_best)),
-                wording.share(float(np.mean(gaps))), wording.share(max(gaps)),
+                f'<span class="key">{escape(q.title)}</span>',
+                q.text(of_best[0]),
+                q.text(of_best[1]),
+                wording.percent(wording.relative(*of_best)),
+                wording.share(float(np.mean(gaps))),
+                wording.share(max(gaps)),
                 "–" if rank is None else f"{rank:.2f}".replace("-", "−"),
             ]
         )
         if q.name == "centroid_travel":
             worst = (float(np.mean(gaps)), rank)
-    head = ["", "best found,<br>learned", "best found,<br>solver", "gap", "mean |gap|",
-            "largest |gap|", "rank<br>correlation"]
+    head = [
+        "",
+        "best found,<br>learned",
+        "best found,<br>solver",
+        "gap",
+        "mean |gap|",
+        "largest |gap|",
+        "rank<br>correlation",
+    ]
     count = len(compared)
     names = ", ".join(d.label.lower() for d in compared)
     intro = (
@@ -121,51 +135,68 @@ def choice(run: RunResults, pictures: Pictures) -> str:
     """The trade-off and the ranked layouts."""
     parts = []
     if "tradeoff" in pictures:
-        parts.append(page.picture(
-            *pictures["tradeoff"], "Centroid travel against upstream depth",
-            "Down is a shorter flow, left is a shallower one. Lines join what the two simulators "
-            "say of one layout.",
-        ))
-    layouts = [d for d in run.designs if d.centres is not None]
+        parts.append(
+            page.picture(
+                *pictures["tradeoff"],
+                "Centroid travel against upstream depth",
+                "Down is a shorter flow, left a shallower one. A line joins what the two simulators "
+                "say of one layout.",
+            )
+        )
+    layouts = [(d, d.centres) for d in run.designs if d.centres is not None]
     if run.scene is not None and layouts:
         known = {q.name: q for q in wording.quantities(run.scene)}
         rows = []
-        for design in layouts:
+        for design, layout in layouts:
             kind = {"best": "best", "paper": "ownfill"}.get(design.key, "ranked")
-            placed = run.scene.with_baffles(design.centres)
+            placed = run.scene.with_baffles(layout)
             values = design.verified or design.surrogate
             mark = "" if design.verified else " *"
             centres = " ".join(
-                f'<span class="nowrap">({", ".join(f"{v:.3f}" for v in c)})</span>'
-                for c in design.centres
+                f'<span class="nowrap">({", ".join(f"{v:.3f}" for v in c)})</span>' for c in layout
             )
             label = f'<span class="key">{escape(design.label)}</span><small>{centres}</small>'
             rows.append(
-                [thumbnail(run.scene, placed, kind), label, escape(design.origin or "–"),
-                 _cost(design.cost), "failed" if design.status not in ("", "ok") else
-                 _cost(design.verified_cost)]
+                [
+                    thumbnail(run.scene, placed, kind),
+                    label,
+                    escape(design.origin or "–"),
+                    _cost(design.cost),
+                    "failed" if design.status not in ("", "ok") else _cost(design.verified_cost),
+                ]
                 + [known[n].text(values.get(n)) + mark for n in HEADLINE]
             )
-        head = ["", "", "from", "objective,<br>learned", "objective,<br>solver",
-                *(escape(_column(n)) for n in HEADLINE)]
+        head = [
+            "",
+            "",
+            "from",
+            "objective,<br>learned",
+            "objective,<br>solver",
+            *(escape(_column(n)) for n in HEADLINE),
+        ]
         note = (
             f'<p class="fine">* by the {run.searcher}: not verified.</p>'
-            if any(not d.verified for d in layouts)
+            if any(not d.verified for d, _ in layouts)
             else ""
         )
         parts.append(f'<div class="card">{page.table(head, rows, text=(1, 2))}{note}</div>')
     if not parts:
         return ""
     return page.section(
-        "What else there was to choose from", *parts,
+        "What else there was to choose from",
+        *parts,
         intro="A shorter flow is mostly paid for with more depth before the baffles. The objective "
         "weighs one against the other; if your site weighs them differently, pick another.",
     )
 
 
 def _column(name: str) -> str:
-    return {"centroid_travel": "centroid travel", "upstream_depth": "upstream depth",
-            "runout_p99": "runout p99", "mass_past_section": "mass past"}[name]
+    return {
+        "centroid_travel": "centroid travel",
+        "upstream_depth": "upstream depth",
+        "runout_p99": "runout p99",
+        "mass_past_section": "mass past",
+    }[name]
 
 
 def _cost(value: float | None) -> str:
@@ -176,19 +207,22 @@ def search(run: RunResults, pictures: Pictures) -> str:
     """How the objective fell."""
     if "history" not in pictures:
         return ""
-    done = [t for t in run.trials if t.cost is not None]
+    done = [(t.cost, t.number, t.origin) for t in run.trials if t.cost is not None]
     failed = len(run.trials) - len(done)
-    first = min(done, key=lambda t: t.cost)
+    cost, number, origin = min(done)
     intro = (
         f"{len(run.trials)} layouts were tried on the {run.searcher}; the lowest objective, "
-        f"{first.cost:.4f}, came from {escape(first.origin)} at number {first.number + 1}."
+        f"{cost:.4f}, came from {escape(origin)} at number {number + 1}."
     )
     if failed:
         intro += f" {failed} rollout{'s' if failed > 1 else ''} failed and counted with a penalty."
     return page.section(
         "How the search went",
-        page.picture(*pictures["history"], "Objective against rollouts",
-                     "The objective is relative to no baffles, as the search saw it. "
-                     "Values far above the rest are drawn at the top edge."),
+        page.picture(
+            *pictures["history"],
+            "Objective against rollouts",
+            "The objective is relative to no baffles, as the search saw it. "
+            "Values far above the rest are drawn at the top edge.",
+        ),
         intro=intro,
     )

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from design import views
 from design.results import LEARNED, SOLVER, Design, RunResults
@@ -56,9 +57,9 @@ def plan_over_time(run: RunResults, theme: Theme) -> Figure | None:
 
 def side_over_time(run: RunResults, theme: Theme) -> Figure | None:
     """The same from the side: share of the width that is filled."""
-    return _over_time(
-        run, theme, views.side_map, views.draw_side, "y [m]", "share of the width filled", 2
-    )
+    plane = run.scene is not None and run.scene.dim == 2
+    quantity = "packing, 1 as released" if plane else "share of the width filled"
+    return _over_time(run, theme, views.side_map, views.draw_side, "y [m]", quantity, 2)
 
 
 def _over_time(
@@ -79,8 +80,8 @@ def _over_time(
     height = (views.side_top(scene) - scene.base) if side else scene.domain.size[-1]
     panel = (WIDTH - 1.35) / (len(INSTANTS) + 1)
     row = panel * height / scene.domain.size[0]
-    figure = Figure(figsize=(WIDTH, len(rows) * (row + 0.27) + 0.4), layout="constrained")
-    figure.get_layout_engine().set(w_pad=0.03, h_pad=0.05, wspace=0.01, hspace=0.02)
+    engine = ConstrainedLayoutEngine(w_pad=0.03, h_pad=0.05, wspace=0.01, hspace=0.02)
+    figure = Figure(figsize=(WIDTH, len(rows) * (row + 0.27) + 0.4), layout=engine)
     grid = figure.subplots(len(rows), len(INSTANTS) + 1, squeeze=False, sharex=True, sharey=True)
     times = _instants(rows[0][1])
     maps = [[to_map(flow, views.frame_at(flow, t)) for t in times] for _, flow in rows]
@@ -98,8 +99,9 @@ def _over_time(
             if r == len(rows) - 1:
                 axes.set_xlabel("x [m]")
         grid[r, 0].set_ylabel(ylabel)
-    bar = figure.colorbar(image, ax=grid, aspect=38 if len(rows) > 1 else 20,
-                          pad=0.012, shrink=0.9, extend="max")
+    bar = figure.colorbar(
+        image, ax=grid, aspect=38 if len(rows) > 1 else 20, pad=0.012, shrink=0.9, extend="max"
+    )
     bar.set_label(quantity)
     bar.outline.set_visible(False)
     return figure

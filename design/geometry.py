@@ -61,7 +61,9 @@ def baffle_mesh(scene: Scene) -> trimesh.Trimesh:
     """
     if not scene.baffles:
         raise ValueError("the scene has no baffles to draw")
-    return trimesh.util.concatenate([_box(*corners) for corners in _in_3d(scene.baffle_boxes())])
+    boxes = [_box(*corners) for corners in _in_3d(scene.baffle_boxes())]
+    mesh: trimesh.Trimesh = trimesh.util.concatenate(boxes)  # type: ignore[assignment]
+    return mesh
 
 
 def scene_graph(scene: Scene) -> trimesh.Scene:

@@ -31,6 +31,7 @@ section{margin-top:52px}
 section>h2+figure,section>h2+div{margin-top:16px}section>p:first-of-type{margin-bottom:18px}
 .card{background:var(--paper);border:1px solid var(--line);border-radius:12px;padding:22px 24px}
 .answer{display:grid;grid-template-columns:minmax(0,1.22fr) minmax(0,1fr);gap:28px;margin-top:28px}
+.answer>.card{display:flex;flex-direction:column;justify-content:center}
 .stack{display:flex;flex-direction:column;gap:16px}
 .tiles{display:grid;grid-template-columns:1fr 1fr;gap:16px;flex:1}
 .tile{background:var(--paper);border:1px solid var(--line);border-radius:12px;padding:16px 18px}
@@ -87,7 +88,7 @@ pre{background:var(--ground);border:1px solid var(--line);border-radius:8px;padd
  white-space:pre-wrap;overflow-wrap:anywhere}
 .columns{display:grid;grid-template-columns:repeat(auto-fit,minmax(290px,1fr));gap:16px}
 .columns table{font-size:13.5px}.columns td{padding:6px 0 6px 14px;overflow-wrap:anywhere;
- white-space:normal}.columns td:first-child{color:var(--muted)}
+ white-space:normal}.columns td:first-child{color:var(--muted);padding-left:0}
 .note{border-left:3px solid var(--bad);padding:2px 0 2px 16px;margin:22px 0 0}
 .note p{margin:6px 0 0}.note ul{margin:4px 0 0;padding-left:18px}
 footer{margin-top:56px;color:var(--muted);font-size:13px}
@@ -128,6 +129,7 @@ def section(title: str, *content: str, intro: str = "") -> str:
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], *, text: Sequence[int] = ()) -> str:
     """A table of ready HTML cells; the columns in `text` are set to the left."""
+
     def cell(tag: str, k: int, content: str) -> str:
         return f"<{tag}{' class=text' if k in text else ''}>{content}</{tag}>"
 

@@ -89,6 +89,7 @@ def optimise(
                     run.write(INTERRUPTED)
                 raise
         run.publish(bar)
+        run.log.close()
     return run.summary
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
 from design.results import RunResults
 from design.theme import WIDTH, Theme, layout_colour
@@ -26,26 +27,62 @@ def history(run: RunResults, theme: Theme) -> Figure | None:
     origins = list(dict.fromkeys(t.origin for t in trials))
     for origin, colour in zip(origins, _cycle(theme.origins, len(origins)), strict=True):
         chosen = np.array([t.origin == origin for t in trials])
-        axes.scatter(number[chosen], np.minimum(cost[chosen], top), s=17, color=colour,
-                     alpha=0.85, linewidths=0, label=origin, zorder=3)
-    axes.step(number, np.minimum.accumulate(cost), where="post", color=theme.best, lw=1.8,
-              label="best so far", zorder=4)
+        axes.scatter(
+            number[chosen],
+            np.minimum(cost[chosen], top),
+            s=17,
+            color=colour,
+            alpha=0.85,
+            linewidths=0,
+            label=origin,
+            zorder=3,
+        )
+    axes.step(
+        number,
+        np.minimum.accumulate(cost),
+        where="post",
+        color=theme.best,
+        lw=1.8,
+        label="best so far",
+        zorder=4,
+    )
     for key in ("paper", "none"):
         design = run.design(key)
         if design is not None and design.cost is not None and design.cost <= top + 0.5 * span:
             colour = layout_colour(theme, key)
             axes.axhline(design.cost, color=colour, lw=1.1, ls=(0, (5, 3)), zorder=2)
-            axes.annotate(design.label, (1.0, design.cost), xycoords=("axes fraction", "data"),
-                          xytext=(-2, 3), textcoords="offset points", ha="right", color=colour,
-                          fontsize=8.5)
+            axes.annotate(
+                design.label,
+                (1.0, design.cost),
+                xycoords=("axes fraction", "data"),
+                xytext=(-2, 3),
+                textcoords="offset points",
+                ha="right",
+                color=colour,
+                fontsize=8.5,
+            )
     failed = [t.number + 1 for t in run.trials if t.cost is None]
     if failed:
-        axes.plot(failed, np.full(len(failed), axes.get_ylim()[1]), "x", color=theme.bad, ms=5,
-                  label="failed", clip_on=False, zorder=5)
+        axes.plot(
+            failed,
+            np.full(len(failed), axes.get_ylim()[1]),
+            "x",
+            color=theme.bad,
+            ms=5,
+            label="failed",
+            clip_on=False,
+            zorder=5,
+        )
     axes.set(xlabel="rollout", ylabel=f"objective by the {run.searcher} [-]")
-    axes.xaxis.get_major_locator().set_params(integer=True)
-    axes.legend(ncols=8, loc="lower left", bbox_to_anchor=(-0.01, 1.0), borderaxespad=0.2,
-                handletextpad=0.3, columnspacing=1.3)
+    axes.xaxis.set_major_locator(MaxNLocator(9, integer=True))
+    axes.legend(
+        ncols=8,
+        loc="lower left",
+        bbox_to_anchor=(-0.01, 1.0),
+        borderaxespad=0.2,
+        handletextpad=0.3,
+        columnspacing=1.3,
+    )
     return figure
 
 
@@ -75,20 +112,51 @@ def trade_off(run: RunResults, theme: Theme) -> Figure | None:
             axes.plot(*surrogate, "o", mfc=theme.paper, mec=colour, ms=7, mew=1.6, zorder=4)
         if verified:
             axes.plot(*verified, "o", color=colour, ms=8.5, zorder=5)
-        if design.key in ("best", "paper", "none"):
-            axes.annotate(design.label, verified or surrogate, xytext=(8, 5),
-                          textcoords="offset points", color=colour, weight="bold", zorder=6)
+        where = verified or surrogate
+        if where and design.key in ("best", "paper", "none"):
+            axes.annotate(
+                design.label,
+                where,
+                xytext=(8, 5),
+                textcoords="offset points",
+                color=colour,
+                weight="bold",
+                zorder=6,
+            )
     axes.margins(0.09)
     axes.set(xlabel="peak depth upstream of a baffle [m]", ylabel="centroid travel [m]")
     handles = [
         Line2D([], [], marker="o", ls="", color=theme.ink, ms=8, label="reference solver"),
-        Line2D([], [], marker="o", ls="", mfc=theme.paper, mec=theme.ink, mew=1.5, ms=7,
-               label=run.searcher),
-        Line2D([], [], marker="o", ls="-", lw=1, color=theme.muted, ms=4,
-               label="rollouts of the search and their Pareto front"),
+        Line2D(
+            [],
+            [],
+            marker="o",
+            ls="",
+            mfc=theme.paper,
+            mec=theme.ink,
+            mew=1.5,
+            ms=7,
+            label=run.searcher,
+        ),
+        Line2D(
+            [],
+            [],
+            marker="o",
+            ls="-",
+            lw=1,
+            color=theme.muted,
+            ms=4,
+            label="rollouts of the search and their Pareto front",
+        ),
     ]
-    axes.legend(handles=handles if cloud else handles[:2], ncols=3, loc="lower left",
-                bbox_to_anchor=(-0.01, 1.0), borderaxespad=0.2, handletextpad=0.3)
+    axes.legend(
+        handles=handles if cloud else handles[:2],
+        ncols=3,
+        loc="lower left",
+        bbox_to_anchor=(-0.01, 1.0),
+        borderaxespad=0.2,
+        handletextpad=0.3,
+    )
     return figure
 
 

@@ -52,8 +52,8 @@ class Theme:
         """Depth of sand: the ground where there is none, then thin to thick."""
         return LinearSegmentedColormap.from_list(f"sand-{self.name}", [self.ground, *self.sand])
 
-    def rc(self) -> dict[str, Any]:
-        """matplotlib settings: hairlines, no box, text in the page's ink."""
+    def rc(self) -> Any:
+        """matplotlib settings, a dict: hairlines, no box, text in the page's ink."""
         return {
             "font.family": _available_fonts(),
             "font.size": 9,

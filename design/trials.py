@@ -20,6 +20,8 @@ from typing import Any
 import numpy as np
 import optuna
 from optuna.trial import FrozenTrial, TrialState
+from sqlalchemy import event
+from sqlalchemy.exc import SQLAlchemyError
 
 from design.parameters import names, ordered, to_centres, to_parameters
 from gns_env.layout import LayoutSpace
@@ -93,6 +95,7 @@ class TrialLog:
             name: optuna.distributions.FloatDistribution(0.0, 1.0) for name in names(space)
         }
         self._asked: dict[int, optuna.Trial] = {}
+        self._backend: optuna.storages.RDBStorage | None = None
 
     @classmethod
     def open(
@@ -118,10 +121,7 @@ class TrialLog:
                 or it belongs to another task.
         """
         with storage_errors(storage):
-            arguments = {"timeout": 60} if storage.startswith("sqlite") else {}
-            backend = optuna.storages.RDBStorage(
-                storage, engine_kwargs={"connect_args": arguments, "pool_pre_ping": True}
-            )
+            backend = _backend(storage)
             try:
                 study = optuna.create_study(
                     storage=backend, study_name=name, direction="minimize", load_if_exists=resume
@@ -139,7 +139,14 @@ class TrialLog:
             if owned:
                 for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
                     study.tell(trial.number, state=TrialState.FAIL)
-        return cls(study, space)
+        log = cls(study, space)
+        log._backend = backend
+        return log
+
+    def close(self) -> None:
+        """Leave the storage; an SQLite file is one file again then."""
+        if self._backend is not None:
+            self._backend.engine.dispose()
 
     def ask(
         self, count: int, sampler: optuna.samplers.BaseSampler, origin: str = "bayes"
@@ -168,7 +175,7 @@ class TrialLog:
         """Record what a proposal gave. A failure is told with its finite penalty."""
         trial = self._asked.pop(proposal.number)
         trial.set_user_attr("record", _record(proposal.origin, proposal.centres, outcome))
-        self.study.tell(trial, outcome.cost)
+        self.study.tell(trial, self._value(outcome))
         return Trial(proposal.number, proposal.origin, proposal.centres, outcome)
 
     def add(self, origin: str, centres: np.ndarray, outcome: Outcome) -> Trial:
@@ -178,11 +185,21 @@ class TrialLog:
             optuna.create_trial(
                 params=to_parameters(self.space, centres),
                 distributions=self.distributions,
-                value=outcome.cost,
+                value=self._value(outcome),
                 user_attrs={"record": _record(origin, centres, outcome)},
             )
         )
         return Trial(len(self.study.get_trials(deepcopy=False)) - 1, origin, centres, outcome)
+
+    def _value(self, outcome: Outcome) -> float:
+        """What the sampler is told: a failure is worse than all that worked by their whole spread.
+
+        Its own cost lies so far off that a model of all trials would see nothing else.
+        """
+        if outcome.status == "ok":
+            return outcome.cost
+        costs = [trial.cost for trial in self.trials() if trial.ok]
+        return 2 * max(costs) - min(costs) if len(costs) > 1 else outcome.cost
 
     def abandon(self) -> None:
         """Mark what was asked for and will not be told, so that nobody waits for it."""
@@ -238,8 +255,6 @@ def table(trials: Sequence[Trial]) -> str:
 @contextlib.contextmanager
 def storage_errors(storage: str) -> Iterator[None]:
     """Turn what a database can throw (unreachable, full disk, foreign file) into a StudyError."""
-    from sqlalchemy.exc import SQLAlchemyError
-
     try:
         yield
     except (SQLAlchemyError, optuna.exceptions.StorageInternalError, ImportError) as error:
@@ -255,6 +270,25 @@ def storage_errors(storage: str) -> Iterator[None]:
         raise StudyError(f"study storage {storage.rsplit('@', 1)[-1]}: {error}") from error
 
 
+def _backend(storage: str) -> optuna.storages.RDBStorage:
+    if not storage.startswith("sqlite"):
+        return optuna.storages.RDBStorage(storage, engine_kwargs={"pool_pre_ping": True})
+    backend = optuna.storages.RDBStorage(
+        storage, engine_kwargs={"connect_args": {"timeout": 60}}
+    )
+
+    def tune(connection: Any, _: Any) -> None:
+        # A trial is about ten commits, each a wait for the disk (30 ms on a busy one) unless the
+        # log is written ahead; a power cut may then cost the last trials and never the file.
+        with contextlib.suppress(Exception):  # a file system that cannot do it does without
+            connection.execute("PRAGMA journal_mode=WAL").fetchone()
+            connection.execute("PRAGMA synchronous=NORMAL")
+
+    event.listen(backend.engine, "connect", tune)
+    backend.engine.dispose()  # connect anew
+    return backend
+
+
 def sqlite_url(path: str | os.PathLike[str]) -> str:
     """The storage address of an SQLite file."""
     return f"sqlite:///{Path(path).resolve()}"
@@ -264,6 +298,7 @@ def _record(origin: str, centres: np.ndarray, outcome: Outcome) -> dict[str, Any
     return {
         "origin": origin,
         "centres": np.asarray(centres).tolist(),
+        "cost": outcome.cost,
         "measures": outcome.measures,
         "status": outcome.status,
         "rollouts": outcome.rollouts,
@@ -274,10 +309,10 @@ def _record(origin: str, centres: np.ndarray, outcome: Outcome) -> dict[str, Any
 
 def _trial(frozen: FrozenTrial) -> Trial | None:
     record = frozen.user_attrs.get("record")
-    if record is None or frozen.value is None:
+    if record is None:
         return None
     outcome = Outcome(
-        cost=float(frozen.value),
+        cost=float(record["cost"]),
         measures=dict(record["measures"]),
         status=str(record["status"]),
         rollouts=int(record["rollouts"]),

@@ -58,7 +58,9 @@ def side_map(trajectory: Trajectory, frame: int, *, cell: float | None = None) -
     low, high = np.array(scene.domain.lower[:2]), np.array(scene.domain.upper[:2])
     shape = np.maximum(np.rint((high - low) / cell).astype(int), 1)
     points = moving_positions(trajectory)[frame][:, :2]
-    counts, _, _ = np.histogram2d(*points.T, bins=shape, range=list(zip(low, high, strict=True)))
+    counts, _ = np.histogramdd(
+        points, bins=[int(n) for n in shape], range=list(zip(low, high, strict=True))
+    )
     width = scene.domain.size[2] if scene.dim == 3 else 1.0
     filled = counts * trajectory.point_volume / (float(np.prod((high - low) / shape)) * width)
     return Map(_blur(filled), (low[0], high[0], low[1], high[1]))
@@ -78,8 +80,15 @@ def surface(
 def draw_map(axes: Axes, shown: Map, theme: Theme, top: float) -> AxesImage:
     """Draw a map from nothing to `top`; returns the image, whose data an animation replaces."""
     return axes.imshow(
-        as_image(shown), extent=shown.extent, origin="lower", cmap=theme.colormap(),
-        vmin=0.0, vmax=top, interpolation="bicubic", aspect="equal", zorder=0,
+        as_image(shown),
+        extent=shown.extent,
+        origin="lower",
+        cmap=theme.colormap(),
+        vmin=0.0,
+        vmax=top,
+        interpolation="bicubic",
+        aspect="equal",
+        zorder=0,
     )
 
 
@@ -111,17 +120,21 @@ def draw_side(axes: Axes, scene: Scene, theme: Theme, colour: str, *, ticks: flo
 
 def side_top(scene: Scene) -> float:
     """Height to which a side view is worth drawing [m]: above it nothing is ever seen."""
-    tallest = max(
-        [r.upper[1] for r in scene.releases] + [b[1, 1] for b in scene.baffle_boxes()]
-    )
+    tallest = max([r.upper[1] for r in scene.releases] + [b[1, 1] for b in scene.baffle_boxes()])
     return min(scene.domain.upper[1], scene.base + 1.45 * (tallest - scene.base))
 
 
 def _rectangle(axes: Axes, low, high, theme: Theme, colour: str, alpha: float = 1.0) -> None:
     axes.add_patch(
         Rectangle(
-            tuple(low), high[0] - low[0], high[1] - low[1],
-            facecolor=colour, edgecolor=theme.paper, linewidth=0.8, alpha=alpha, zorder=3,
+            tuple(low),
+            high[0] - low[0],
+            high[1] - low[1],
+            facecolor=colour,
+            edgecolor=theme.paper,
+            linewidth=0.8,
+            alpha=alpha,
+            zorder=3,
         )
     )
 

@@ -47,21 +47,70 @@ def quantities(scene: Scene | None) -> list[Quantity]:
     section = f"x = {scene.control_section:.2f} m" if scene else "the control section"
     energy = "J" if scene is None or scene.dim == 3 else "J/m"
     return [
-        Quantity("centroid_travel", "Centroid travel", "m", 1, 3, -1,
-                 "How far the centre of mass has moved downstream at the end."),
-        Quantity("upstream_depth", "Peak depth upstream of a baffle", "m", 1, 3, -1,
-                 "Deepest flow in the 10 cm before a baffle; without baffles the deepest in "
-                 "windows of the same size."),
-        Quantity("runout_p99", "Runout, 99th percentile", "m", 1, 3, -1,
-                 "Travel of the front that 1 % of the mass lies beyond."),
-        Quantity("mass_past_section", f"Mass past {section}", "%", 100, 2, -1,
-                 "Share of the mass beyond the control section at the end."),
-        Quantity("overtopping", "Mass over a baffle's top", "%", 100, 2, -1,
-                 "Share of the mass that crossed above the plan of a baffle at some time."),
-        Quantity("energy_dissipated", "Energy dissipated", energy, 1, 0, 0,
-                 "Potential and kinetic energy lost from start to end; mass held high keeps some."),
-        Quantity("runout_max", "Farthest grain", "m", 1, 3, 0,
-                 "The paper's runout. Single grains decide it: reported, never optimised."),
+        Quantity(
+            "centroid_travel",
+            "Centroid travel",
+            "m",
+            1,
+            3,
+            -1,
+            "How far the centre of mass has moved downstream at the end.",
+        ),
+        Quantity(
+            "upstream_depth",
+            "Peak depth upstream of a baffle",
+            "m",
+            1,
+            3,
+            -1,
+            "Deepest flow in the 10 cm before a baffle; without baffles the deepest in "
+            "windows of the same size.",
+        ),
+        Quantity(
+            "runout_p99",
+            "Runout, 99th percentile",
+            "m",
+            1,
+            3,
+            -1,
+            "Travel of the front that 1 % of the mass lies beyond.",
+        ),
+        Quantity(
+            "mass_past_section",
+            f"Mass past {section}",
+            "%",
+            100,
+            2,
+            -1,
+            "Share of the mass beyond the control section at the end.",
+        ),
+        Quantity(
+            "overtopping",
+            "Mass over a baffle's top",
+            "%",
+            100,
+            2,
+            -1,
+            "Share of the mass that crossed above the plan of a baffle at some time.",
+        ),
+        Quantity(
+            "energy_dissipated",
+            "Energy dissipated",
+            energy,
+            1,
+            0,
+            0,
+            "Potential and kinetic energy lost from start to end; mass held high keeps some.",
+        ),
+        Quantity(
+            "runout_max",
+            "Farthest grain",
+            "m",
+            1,
+            3,
+            0,
+            "The paper's runout. Single grains decide it: reported, never optimised.",
+        ),
     ]
 
 
@@ -85,7 +134,7 @@ def share(value: float) -> str:
 
 
 def verdict(change: float | None, sense: int, name: str = "centroid_travel") -> str:
-    """"better", "worse", "same", or "" where neither is meant, of a change in a measure."""
+    """ "better", "worse", "same", or "" where neither is meant, of a change in a measure."""
     if change is None or sense == 0:
         return ""
     if negligible(change, name):
@@ -99,7 +148,7 @@ def negligible(change: float, name: str = "centroid_travel") -> bool:
 
 
 def count(number: int, noun: str) -> str:
-    """"Three baffles", "One baffle", "12 baffles"."""
+    """ "Three baffles", "One baffle", "12 baffles"."""
     numeral = NUMERALS[number] if number < len(NUMERALS) else str(number)
     return f"{numeral} {noun}{'' if number == 1 else 's'}"
 

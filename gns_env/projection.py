@@ -275,7 +275,8 @@ class _Programme:
             side[self.rows, a.axis] = a.order
             self.side.value, self.gap.value = side, separation[a.axis]
         try:
-            self.problem.solve(solver=cp.CLARABEL)
+            # No warm start: the answer must not depend on what was asked before.
+            self.problem.solve(solver=cp.CLARABEL, warm_start=False)
         except cp.error.SolverError:
             return None
         if self.centres.value is None or not np.isfinite(self.centres.value).all():

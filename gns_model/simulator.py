@@ -56,8 +56,9 @@ def load_simulator(name: str | os.PathLike[str], device: str = "cpu", **options:
     shipped = shipped_models()
     path = shipped.get(str(name), Path(name))
     if not str(name) or not path.exists():
+        known = ", ".join(["mpm", *sorted(shipped)])
         raise SimulatorError(
-            f"no simulator named {str(name)!r}: give mpm, {', '.join(sorted(shipped))}, or the "
+            f"no simulator named {str(name)!r}: give {known}, or the "
             "path of a checkpoint folder"
         )
     _check_options(load_model, path, device=device, **options)

@@ -135,11 +135,3 @@ class LearnedModel(nn.Module):
         if config.baffles == "points":
             after = torch.where(world.moving[:, None], after, now)
         return after
-
-    def target(self, history: Tensor, after: Tensor, world: World) -> Tensor:
-        """The normalised acceleration that makes `step` end at `after` (N, D), contact aside."""
-        before, now = history[:, -2], history[:, -1]
-        acceleration = ((after - now) - (now - before)) / self.config.dt**2
-        if self.config.subtract_gravity:
-            acceleration = acceleration - world.point_gravity
-        return (acceleration - self.acceleration_mean) / self.acceleration_std

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -27,7 +29,9 @@ class MLP(nn.Module):
     ) -> None:
         super().__init__()
         sizes = [inputs] + [latent] * hidden_layers + [outputs]
-        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(sizes))
+        linear = [nn.Linear(a, b) for a, b in itertools.pairwise(sizes)]
+        # A ModuleList registers them; typed as what it holds.
+        self.layers: Sequence[nn.Linear] = nn.ModuleList(linear)  # type: ignore[assignment]
         self.activation = activation
         self.norm = nn.LayerNorm(outputs) if norm else None
 
@@ -37,7 +41,7 @@ class MLP(nn.Module):
 
     def after_first(self, h: Tensor) -> Tensor:
         """The rest, given the value of the first linear layer before its activation."""
-        for layer in self.layers[1:]:
+        for layer in list(self.layers)[1:]:
             h = layer(ACTIVATIONS[self.activation](h))
         return h if self.norm is None else self.norm(h)
 
@@ -69,7 +73,7 @@ class MLP(nn.Module):
             receivers,
             first=first,
             biases=[layer.bias for layer in self.layers],
-            weights=[layer.weight for layer in self.layers[1:]],
+            weights=[layer.weight for layer in list(self.layers)[1:]],
             norm=(self.norm.weight, self.norm.bias),
             activation=self.activation,
             dtype=dtype,
@@ -84,10 +88,10 @@ class Block(nn.Module):
 
     def __init__(self, latent: int, hidden_layers: int, activation: str) -> None:
         super().__init__()
-        kwargs = {"latent": latent, "hidden_layers": hidden_layers, "activation": activation}
+        mlp = partial(MLP, latent=latent, hidden_layers=hidden_layers, activation=activation)
         self.latent = latent
-        self.edge = MLP(3 * latent, latent, **kwargs)
-        self.vertex = MLP(2 * latent, latent, **kwargs)
+        self.edge = mlp(3 * latent, latent)
+        self.vertex = mlp(2 * latent, latent)
 
     def forward(
         self,
@@ -126,11 +130,11 @@ class EncodeProcessDecode(nn.Module):
         activation: str,
     ) -> None:
         super().__init__()
-        kwargs = {"latent": latent, "hidden_layers": hidden_layers, "activation": activation}
-        self.encode_vertex = MLP(vertex_inputs, latent, **kwargs)
-        self.encode_edge = MLP(edge_inputs, latent, **kwargs)
+        mlp = partial(MLP, latent=latent, hidden_layers=hidden_layers, activation=activation)
+        self.encode_vertex = mlp(vertex_inputs, latent)
+        self.encode_edge = mlp(edge_inputs, latent)
         self.blocks = nn.ModuleList(Block(latent, hidden_layers, activation) for _ in range(blocks))
-        self.decode = MLP(latent, outputs, norm=False, **kwargs)
+        self.decode = mlp(latent, outputs, norm=False)
 
     def forward(
         self,

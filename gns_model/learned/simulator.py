@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 import time
 import warnings
 from collections.abc import Iterator, Sequence
@@ -13,21 +12,17 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint as rematerialise
 
 from gns_model.errors import SimulatorError
 from gns_model.learned.model import LearnedModel
-from gns_model.learned.world import World, baffle_boxes, baffle_points
-from gns_model.particles import MOVING, STATIONARY, Points, fill
+from gns_model.learned.rollout import frame_count, roll_out, roll_out_tensor
+from gns_model.particles import MOVING, Points, fill
 from gns_model.scene import Scene
 from gns_model.simulator import Progress
 from gns_model.trajectory import DIVERGED, OK, Trajectory
 
 #: Points in one batch. On a CPU more would only leave the caches; a GPU wants to be filled.
 BATCH_POINTS = {"cpu": 16_000, "cuda": 400_000}
-
-#: A grain this many times faster than release and fall could make it has diverged.
-_SPEED_MARGIN = 4.0
 
 
 class LearnedSimulator:
@@ -76,11 +71,6 @@ class LearnedSimulator:
         """Where the model runs."""
         return self.model.velocity_std.device
 
-    @property
-    def dtype(self) -> torch.dtype:
-        """The dtype of the positions: that of the model."""
-        return self.model.velocity_std.dtype
-
     def check(self, scene: Scene) -> None:
         """Refuse a scene that this model cannot run, and warn, once, of what it never saw.
 
@@ -126,20 +116,30 @@ class LearnedSimulator:
         if self.workers > 1 and len(scenes) > 1 and self.device.type == "cpu":
             return self._share(scenes, progress)
         points = [fill(scene, self.config.spacing) for scene in scenes]
-        work = [len(p.positions) * self.frames(s) for s, p in zip(scenes, points, strict=True)]
+        work = [
+            len(p.positions) * frame_count(self.config, scene)
+            for scene, p in zip(scenes, points, strict=True)
+        ]
         total, done = max(1, sum(work)), 0.0
+        most = BATCH_POINTS.get(self.device.type, BATCH_POINTS["cuda"])
         trajectories: list[Trajectory] = []
-        for group in groups([len(p.positions) for p in points], self._batch_points()):
+        for group in groups([len(p.positions) for p in points], most):
             share = sum(work[k] for k in group)
 
             def advance(fraction: float, done: float = done, share: float = share) -> None:
                 if progress is not None:
                     progress(min(1.0, (done + fraction * share) / total))
 
-            with self._settings(), torch.inference_mode():
-                trajectories += self._rollout_batch(
-                    [scenes[k] for k in group], [points[k] for k in group], advance
+            began = time.perf_counter()
+            with self._settings():
+                positions, diverged = roll_out(
+                    self.model, [scenes[k] for k in group], [points[k] for k in group], advance
                 )
+            seconds = (time.perf_counter() - began) / len(group)
+            trajectories += [
+                self._trajectory(scenes[k], points[k], positions[j], diverged.get(j), seconds)
+                for j, k in enumerate(group)
+            ]
             done += share
         return trajectories
 
@@ -160,10 +160,6 @@ class LearnedSimulator:
             self._pool.close()
             self._pool = None
 
-    def frames(self, scene: Scene) -> int:
-        """Number of frames of a rollout of `scene`, the start included."""
-        return 1 + max(1, math.floor(scene.duration / self.config.dt + 1e-6))
-
     @contextmanager
     def _settings(self) -> Iterator[None]:
         before = torch.get_num_threads()
@@ -176,59 +172,6 @@ class LearnedSimulator:
         finally:
             if self.threads is not None:
                 torch.set_num_threads(before)
-
-    def _batch_points(self) -> int:
-        return BATCH_POINTS.get(self.device.type, BATCH_POINTS["cuda"])
-
-    def _rollout_batch(
-        self, scenes: list[Scene], points: list[Points], advance: Progress
-    ) -> list[Trajectory]:
-        began = time.perf_counter()
-        moving = [len(p.positions) for p in points]
-        frames = [self.frames(scene) for scene in scenes]
-        dim = self.config.dim
-        out = [np.empty((t, n, dim), np.float32) for t, n in zip(frames, moving, strict=True)]
-        diverged: dict[int, int] = {}
-        histories, types = self._start(scenes, points)
-        for k, history in enumerate(histories):
-            out[k][0] = history[: moving[k], -1].cpu().numpy()
-
-        running = list(range(len(scenes)))
-        world = self._world(scenes, histories, types)
-        window = torch.cat(histories)
-        for frame in range(1, max(frames)):
-            after = self.model.step(window, world)
-            bad = self._diverged(window[:, -1], after, world, [scenes[k] for k in running])
-            window = torch.cat([window[:, 1:], after[:, None]], dim=1)
-            sizes = [len(histories[k]) for k in running]
-            going = []
-            for slot, (k, rows) in enumerate(zip(running, after.split(sizes), strict=True)):
-                if slot in bad:
-                    diverged[k] = frame
-                    out[k][frame:] = out[k][frame - 1]
-                    continue
-                out[k][frame] = rows[: moving[k]].cpu().numpy()
-                if frame + 1 < frames[k]:
-                    going.append(slot)
-            if len(going) < len(running):
-                # Scenes that ended or diverged leave the batch; the rest do not notice.
-                parts = window.split(sizes)
-                running = [running[slot] for slot in going]
-                if not running:
-                    break
-                window = torch.cat([parts[slot] for slot in going])
-                world = self._world(
-                    [scenes[k] for k in running],
-                    [histories[k] for k in running],
-                    [types[k] for k in running],
-                )
-            advance(frame / (max(frames) - 1))
-        advance(1.0)
-        seconds = time.perf_counter() - began
-        return [
-            self._trajectory(scene, points[k], out[k], diverged.get(k), seconds / len(scenes))
-            for k, scene in enumerate(scenes)
-        ]
 
     def _trajectory(
         self,
@@ -256,65 +199,6 @@ class LearnedSimulator:
             settings=settings,
             lattice=points.lattice,
         )
-
-    def _start(
-        self,
-        scenes: Sequence[Scene],
-        points: Sequence[Points],
-        centres: Sequence[Tensor] | None = None,
-    ) -> tuple[list[Tensor], list[Tensor]]:
-        """History (N, H + 1, D) and particle types (N,) of every scene at t = 0.
-
-        Before its release the mass moved as it moves at the release: the history is that motion
-        extended backwards. Kinematic points, if the model wants them, come last.
-        """
-        config, histories, types = self.config, [], []
-        past = torch.arange(config.history, -1, -1, dtype=self.dtype, device=self.device)
-        for k, (scene, start) in enumerate(zip(scenes, points, strict=True)):
-            position = torch.tensor(start.positions, dtype=self.dtype, device=self.device)
-            velocity = torch.tensor(start.velocities, dtype=self.dtype, device=self.device)
-            history = position[:, None] - velocity[:, None] * (past * config.dt)[:, None]
-            kind = torch.full((len(position),), MOVING, device=self.device)
-            if config.baffles == "points":
-                own = centres[k] if centres is not None else None
-                boxes = baffle_boxes(scene, own, device=self.device, dtype=self.dtype)
-                fixed = baffle_points(boxes, config.spacing)
-                history = torch.cat([history, fixed[:, None].expand(-1, len(past), -1)])
-                kind = torch.cat([kind, kind.new_full((len(fixed),), STATIONARY)])
-            histories.append(history)
-            types.append(kind)
-        return histories, types
-
-    def _world(
-        self,
-        scenes: Sequence[Scene],
-        histories: Sequence[Tensor],
-        types: Sequence[Tensor],
-        centres: Sequence[Tensor] | None = None,
-    ) -> World:
-        return World.from_scenes(
-            scenes,
-            [len(h) for h in histories],
-            device=self.device,
-            dtype=self.dtype,
-            centres=centres,
-            particle_type=torch.cat(list(types)),
-        )
-
-    def _diverged(
-        self, now: Tensor, after: Tensor, world: World, scenes: Sequence[Scene]
-    ) -> set[int]:
-        """Slots of the scenes in the batch that have gone astray in this step."""
-        reach = torch.tensor([_furthest_step(s) for s in scenes], dtype=self.dtype).to(now.device)
-        size = world.point_upper - world.point_lower
-        step = (after - now).square().sum(1).sqrt()
-        # Written so that NaN, which compares false, counts as astray.
-        sane = (step <= reach[world.batch] * self.config.dt) & (
-            (after >= world.point_lower - size) & (after <= world.point_upper + size)
-        ).all(1)
-        if bool(sane.all()):
-            return set()
-        return set(world.batch[~sane].unique().tolist())
 
     # -- gradients -----------------------------------------------------------------------------
 
@@ -350,36 +234,16 @@ class LearnedSimulator:
         for scene in scenes:
             self.check(scene)
         points = [fill(scene, self.config.spacing) for scene in scenes]
-        moving = [len(p.positions) for p in points]
-        lengths = [frames or self.frames(scene) for scene in scenes]
         with self._settings():
-            histories, types = self._start(scenes, points, centres)
-            if noise is not None:
-                for history, shift, n in zip(histories, noise, moving, strict=True):
-                    history[:n] += shift.to(history)[:, None]
-            world = self._world(scenes, histories, types, centres)
-            track = list(torch.cat(histories).unbind(1))
-            depth = self.config.history + 1
-
-            def step(*past: Tensor) -> Tensor:
-                return self.model.step(torch.stack(past, dim=1), world)
-
-            for _ in range(1, max(lengths)):
-                past = track[-depth:]
-                if checkpoint and torch.is_grad_enabled():
-                    after = rematerialise(step, *past, use_reentrant=False)
-                else:
-                    after = step(*past)
-                track.append(after)
-        whole = torch.stack(track[depth - 1 :])
-        parts = whole.split([len(h) for h in histories], dim=1)
-        return [p[:t, :n] for p, t, n in zip(parts, lengths, moving, strict=True)]
-
-
-def _furthest_step(scene: Scene) -> float:
-    """A speed [m/s] that no grain of `scene` can have, by a wide margin."""
-    fall = math.sqrt(2 * math.hypot(*scene.gravity) * math.hypot(*scene.domain.size))
-    return _SPEED_MARGIN * (max(math.hypot(*r.velocity) for r in scene.releases) + fall)
+            return roll_out_tensor(
+                self.model,
+                scenes,
+                points,
+                centres,
+                frames=frames,
+                checkpoint=checkpoint,
+                noise=noise,
+            )
 
 
 def groups(sizes: Sequence[int], most: int) -> Iterator[list[int]]:

@@ -106,6 +106,9 @@ class World:
         def tensor(values: object) -> Tensor:
             return torch.tensor(values, dtype=dtype, device=device)
 
+        def corner(values: object) -> Tensor:
+            return torch.tensor(values, dtype=torch.float64, device=device)
+
         boxes = []
         for k, scene in enumerate(scenes):
             own = centres[k] if centres is not None else None
@@ -118,8 +121,8 @@ class World:
             particle_type = torch.full_like(batch, MOVING)
         return cls(
             batch=batch,
-            lower=tensor([s.domain.lower for s in scenes]),
-            upper=tensor([s.domain.upper for s in scenes]),
+            lower=_rounded(corner([s.domain.lower for s in scenes]), dtype, up=True),
+            upper=_rounded(corner([s.domain.upper for s in scenes]), dtype, up=False),
             gravity=tensor([s.gravity for s in scenes]),
             boxes=torch.cat(boxes),
             box_batch=torch.repeat_interleave(index, number),
@@ -147,23 +150,38 @@ def baffle_boxes(
     """
     shape = (len(scene.baffles), scene.dim - 1)
     if centres is None:
-        return torch.tensor(scene.baffle_boxes(), dtype=dtype, device=device)
-    if tuple(centres.shape) != shape:
+        exact = torch.tensor(scene.baffle_boxes(), dtype=torch.float64, device=device)
+    elif tuple(centres.shape) != shape:
         raise ValueError(f"centres must have shape {shape}, got {tuple(centres.shape)}")
-    if not scene.baffles:
-        return torch.zeros((0, 2, scene.dim), dtype=dtype, device=device)
-    centres = centres.to(device=device, dtype=dtype)
-    size = torch.tensor([b.size for b in scene.baffles], dtype=dtype, device=device)
-    base = torch.full_like(centres[:, :1], scene.base)
-    half = torch.cat([size[:, :1], size[:, 2:]], dim=1) / 2
-    low, high = centres - half, centres + half
+    else:
+        centres = centres.to(device=device, dtype=torch.float64)
+        size = torch.tensor([b.size for b in scene.baffles], dtype=torch.float64, device=device)
+        base = torch.full_like(centres[:, :1], scene.base)
+        half = torch.cat([size[:, :1], size[:, 2:]], dim=1) / 2
+        low, high = centres - half, centres + half
+        exact = torch.stack(
+            [
+                torch.cat([low[:, :1], base, low[:, 1:]], dim=1),
+                torch.cat([high[:, :1], base + size[:, 1:2], high[:, 1:]], dim=1),
+            ],
+            dim=1,
+        )
     return torch.stack(
-        [
-            torch.cat([low[:, :1], base, low[:, 1:]], dim=1),
-            torch.cat([high[:, :1], base + size[:, 1:2], high[:, 1:]], dim=1),
-        ],
-        dim=1,
+        [_rounded(exact[:, 0], dtype, up=False), _rounded(exact[:, 1], dtype, up=True)], dim=1
     )
+
+
+def _rounded(exact: Tensor, dtype: torch.dtype, *, up: bool) -> Tensor:
+    """Float64 corners in `dtype`, rounded up or down, so that boxes only grow and domains shrink.
+
+    A point on a face is then never inside the exact baffle, nor outside the exact domain.
+    """
+    near = exact.to(dtype)
+    with torch.no_grad():
+        wrong = near.double() < exact if up else near.double() > exact
+        beyond = torch.nextafter(near, torch.full_like(near, math.inf if up else -math.inf))
+        shift = torch.where(wrong, beyond - near, torch.zeros_like(near))
+    return near + shift
 
 
 def baffle_points(boxes: Tensor, spacing: float) -> Tensor:

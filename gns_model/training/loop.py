@@ -125,8 +125,10 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: threadin
         judged.load_state_dict(model.state_dict())
         average.copy_to(judged)
         scores = validator(judged, stop.is_set)
-        # The same on every rank: the time that the last message brought, not this rank's own.
-        position.validated_at = position.seconds
+        # Rank 0's time for all, or they would disagree about when the next one is due.
+        now = torch.zeros(1, device=ranks.device)
+        now += clock.read() if ranks.rank == 0 else 0.0
+        position.seconds = position.validated_at = float(ranks.sum(now))
         if not scores.complete:
             return
         display.validation(position.step, position.seconds, scores.row())

@@ -79,7 +79,9 @@ class Display:
         if not self._live:
             left = ""
             if done > self._done:
-                left = f"  {_clock((self.total - done) / (done - self._done) * passed)} left"
+                left = (
+                    f"  {_clock(max(0.0, self.total - done) / (done - self._done) * passed)} left"
+                )
             print(
                 f"step {step}  loss {row['loss']:.4f}  lr {row['learning_rate']:.2e}  "
                 f"{row['edges_per_second']:.3g} edges/s  {done:.1f}/{self.total:g} {self.unit}"

@@ -125,7 +125,10 @@ def write_run(
     rng = np.random.default_rng(1)
     with (folder / "trials.csv").open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
-        rows.writerow(["number", "origin", "status", "cost", *measures.UNITS])
+        placed = entries["best"]["layout"]
+        axes = ("x", "z")[: len(placed[0])]
+        columns = [f"{axis}{k}" for k in range(1, len(placed) + 1) for axis in axes]
+        rows.writerow(["number", "origin", "status", "cost", *measures.UNITS, *columns])
         for k in range(trials):
             origin = "baseline" if k < 4 else ("gradient" if k % 3 == 0 else "bayes")
             cost = best_cost + 0.15 * rng.random() * np.exp(-k / trials) + 0.002 * (trials - 1 - k)
@@ -135,7 +138,14 @@ def write_run(
                 for v in entries["best"]["surrogate"].values()
             ]
             rows.writerow(
-                [k, origin, "diverged" if failed else "ok", "" if failed else cost, *values]
+                [
+                    k,
+                    origin,
+                    "diverged" if failed else "ok",
+                    "" if failed else cost,
+                    *values,
+                    *(c + 0.001 * k for centre in placed for c in centre),
+                ]
             )
     summary = {
         "status": "complete" if verified else "interrupted",
@@ -146,10 +156,19 @@ def write_run(
         "rollouts": trials,
         "seconds": {"search": 93.4, "verify": 61.0, "total": 158.2},
         "versions": {"gns_model": "0.1.0", "torch": "2.13.0", "optuna": "5.0.0"},
-        "settings": {"method": "hybrid", "baffles": 3, "budget": trials, "verify": 2, "seed": 0,
-                     "simulator": {"name": "models/<mine> & co", "device": "cpu"},
-                     "objective": {"runout_weight": 1.0, "depth_weight": 0.05,
-                                   "text": "centroid travel + 0.05 x upstream depth"}},
+        "settings": {
+            "method": "hybrid",
+            "baffles": 3,
+            "budget": trials,
+            "verify": 2,
+            "seed": 0,
+            "simulator": {"name": "models/<mine> & co", "device": "cpu"},
+            "objective": {
+                "runout_weight": 1.0,
+                "depth_weight": 0.05,
+                "text": "centroid travel + 0.05 x upstream depth",
+            },
+        },
         "notes": ["the scene is 5 % faster than <baffle-lite> was trained for"],
     }
     (folder / "summary.json").write_text(json.dumps(summary), encoding="utf-8")

@@ -31,7 +31,8 @@ def scene():
 
 def test_stl_is_the_baffles_turned_to_z_up(scene, tmp_path):
     mesh = trimesh.load_mesh(write_geometry(scene, tmp_path, "best")["stl"])
-    assert mesh.is_watertight and mesh.is_winding_consistent
+    assert mesh.is_watertight
+    assert mesh.is_winding_consistent
     assert mesh.volume == pytest.approx(3 * 0.15 * 0.30 * 0.20, rel=1e-5)
     boxes = scene.baffle_boxes()
     lower, upper = boxes[:, 0].min(0), boxes[:, 1].max(0)
@@ -46,7 +47,8 @@ def test_stl_is_the_baffles_turned_to_z_up(scene, tmp_path):
 def test_stl_is_binary_and_names_its_units(scene, tmp_path):
     content = write_geometry(scene, tmp_path, "best")["stl"].read_bytes()
     assert len(content) == 84 + 50 * 12 * len(CENTRES)
-    assert not content.startswith(b"solid") and b"metres; z up" in content[:80]
+    assert not content.startswith(b"solid")
+    assert b"metres; z up" in content[:80]
 
 
 def test_glb_keeps_the_scene_frame(scene, tmp_path):
@@ -60,7 +62,8 @@ def test_glb_keeps_the_scene_frame(scene, tmp_path):
         assert welded.is_watertight
         assert welded.volume == pytest.approx(np.prod(upper - lower), rel=1e-5)
     base = graph.geometry["base"].bounds
-    assert base[1, 1] == pytest.approx(scene.base) and base[0, 1] < scene.base
+    assert base[1, 1] == pytest.approx(scene.base)
+    assert base[0, 1] < scene.base
     np.testing.assert_allclose(base[:, [0, 2]], [[0.1, 0.1], [1.9, 1.9]], atol=1e-6)
 
 

@@ -40,7 +40,7 @@ def test_signed_distance_and_its_gradient(point):
 
 
 def test_normal_on_a_face_is_that_of_the_face():
-    points = torch.tensor([[0.2, 0.1, 0.4], [0.3, 0.4, 0.3], [0.3, 0.1, 0.6]]).double()
+    points = torch.tensor([[0.2, 0.1, 0.4], [0.3, 0.4, 0.3], [0.3, 0.1, 0.6]], dtype=torch.float64)
     distance, normal = signed_distance(points, BOX.expand(3, -1, -1, -1))
     assert distance.abs().max() == 0
     assert normal[:, 0].tolist() == [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]
@@ -58,18 +58,18 @@ def test_everything_fades_with_its_slope():
 
 
 def test_baffle_features_end_at_their_range_and_turn_with_the_scene():
-    far = torch.tensor([[0.7, 0.1, 0.4]]).double()
-    velocity = torch.tensor([[1.0, 2.0, 3.0]]).double()
+    far = torch.tensor([[0.7, 0.1, 0.4]], dtype=torch.float64)
+    velocity = torch.tensor([[1.0, 2.0, 3.0]], dtype=torch.float64)
     assert baffle_features(far, velocity, BOX, 0.2 - 1e-9).abs().max() == 0
     near = baffle_features(far, velocity, BOX, 0.4)
     # w = (1 - 0.2/0.4)², normal +x, approach 1
-    torch.testing.assert_close(near, torch.tensor([[0.25, 0.25, 0, 0, 0.25]]).double())
-    mirror = torch.tensor([1.0, 1.0, -1.0]).double()
+    torch.testing.assert_close(near, torch.tensor([[0.25, 0.25, 0, 0, 0.25]], dtype=torch.float64))
+    mirror = torch.tensor([1.0, 1, -1], dtype=torch.float64)
     flipped = torch.stack([BOX[..., 0, :], BOX[..., 1, :]], dim=-2) * mirror
     flipped = torch.stack(
         [torch.minimum(*flipped.unbind(-2)), torch.maximum(*flipped.unbind(-2))], dim=-2
     )
-    point = torch.tensor([[0.55, 0.45, 0.65]]).double()
+    point = torch.tensor([[0.55, 0.45, 0.65]], dtype=torch.float64)
     one = baffle_features(point, velocity, BOX, 0.3)
     other = baffle_features(point * mirror, velocity * mirror, flipped, 0.3)
     torch.testing.assert_close(other, one * torch.tensor([1, 1, 1, -1, 1]).double())

@@ -1,7 +1,8 @@
-"""Tiny flows with a known motion: grains fly, land and stay. Written as the solver would."""
+"""Tiny flows with a known motion, stored as the solver would store them."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,11 @@ from gns_model.scene import Scene
 from gns_model.trajectory import Trajectory
 
 SPACING, INTERVAL = 0.03125, 0.01
+DRAG = 5.0  #: [1/s]
 
 
-def flying_scene(shift: float = 0.0, speed: float = 1.0) -> Scene:
-    """A cube of 8³ points that is thrown over a floor; a baffle stands aside of its way."""
+def cube_scene(shift: float = 0.0, speed: float = 1.0) -> Scene:
+    """A cube of 8³ points on its way along the floor; a baffle stands aside."""
     return Scene.from_dict(
         {
             "domain": {"lower": [0.0, 0.0, 0.0], "upper": [0.8, 0.8, 0.8]},
@@ -24,7 +26,7 @@ def flying_scene(shift: float = 0.0, speed: float = 1.0) -> Scene:
                 {
                     "lower": [0.05, 0.05, 0.1 + shift],
                     "upper": [0.30, 0.30, 0.35 + shift],
-                    "velocity": [speed, 0.2, 0.1],
+                    "velocity": [speed, 0.0, 0.1],
                 }
             ],
             "baffle": [{"center": [0.6, 0.75], "size": [0.1, 0.2, 0.1]}],
@@ -33,22 +35,31 @@ def flying_scene(shift: float = 0.0, speed: float = 1.0) -> Scene:
     )
 
 
-def flight(scene: Scene, spacing: float = SPACING, frames: int = 21) -> Trajectory:
-    """Ballistic points that stop where they meet the floor: an exact solution, float64 time."""
-    points = fill(scene, spacing)
+def slide(scene: Scene, t: np.ndarray) -> np.ndarray:
+    """Positions at times t (T,): points slow down at DRAG times their velocity, without weight."""
+    points = fill(scene, SPACING)
+    return points.positions + points.velocities * ((1 - np.exp(-DRAG * t)) / DRAG)[:, None, None]
+
+
+def fly(scene: Scene, t: np.ndarray) -> np.ndarray:
+    """Positions at times t (T,): nothing but gravity acts."""
+    points, t = fill(scene, SPACING), t[:, None, None]
+    return points.positions + points.velocities * t + 0.5 * np.asarray(scene.gravity) * t**2
+
+
+def trajectory(
+    scene: Scene, motion: Callable[[Scene, np.ndarray], np.ndarray], frames: int
+) -> Trajectory:
+    """An exact solution, stored as a solver would store it."""
+    points = fill(scene, SPACING)
     time = np.arange(frames) * INTERVAL
-    t = time[:, None, None]
-    path = points.positions + points.velocities * t + 0.5 * np.asarray(scene.gravity) * t**2
-    for k in range(1, frames):
-        landed = path[k, :, 1] < 0.01
-        path[k:, landed] = path[k - 1, landed]
     return Trajectory(
-        positions=path.astype(np.float32),
+        positions=motion(scene, time).astype(np.float32),
         time=time,
         particle_type=np.full(len(points.positions), MOVING, np.int8),
         scene=scene,
         point_volume=points.volume,
-        simulator="flight",
+        simulator="exact",
         lattice=points.lattice,
     )
 
@@ -56,7 +67,7 @@ def flight(scene: Scene, spacing: float = SPACING, frames: int = 21) -> Trajecto
 @pytest.fixture(scope="session")
 def free_scene() -> Scene:
     """A scene without baffles in the way, whose points fly for 0.1 s before any of them lands."""
-    return flying_scene().replace(
+    return cube_scene().replace(
         releases=({"lower": (0.05, 0.4, 0.1), "upper": (0.30, 0.65, 0.35), "velocity": (1, 0, 0)},)
     )
 
@@ -65,26 +76,26 @@ def free_scene() -> Scene:
 def free_flight(free_scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of one trajectory in which nothing but gravity acts."""
     folder = tmp_path_factory.mktemp("free")
-    flight(free_scene, frames=11).save(folder / "free.h5")
+    trajectory(free_scene, fly, 11).save(folder / "free.h5")
     return folder
 
 
 @pytest.fixture(scope="session")
-def flights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def slides(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of four trajectories."""
-    folder = tmp_path_factory.mktemp("flights")
+    folder = tmp_path_factory.mktemp("slides")
     for k in range(4):
-        flight(flying_scene(0.1 * k, 0.8 + 0.2 * k)).save(folder / f"{k:03}.h5")
+        trajectory(cube_scene(0.1 * k, 0.8 + 0.2 * k), slide, 21).save(folder / f"{k:03}.h5")
     return folder
 
 
 @pytest.fixture(scope="session")
-def tiny(flights: Path) -> dict[str, Any]:
-    """A recipe, as plain values, that trains in a second on `flights`."""
+def tiny(slides: Path) -> dict[str, Any]:
+    """A recipe, as plain values, that trains in a second on `slides`."""
     return {
         "name": "tiny",
-        "train": [str(flights)],
-        "valid": [str(flights)],
+        "train": [str(slides)],
+        "valid": [str(slides)],
         "steps": 6,
         "edges_per_batch": 800,
         "statistics_windows": 16,

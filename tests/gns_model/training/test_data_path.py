@@ -104,8 +104,8 @@ def test_statistics_of_free_flight_are_those_of_a_parabola(free_flight):
     )
 
 
-def test_noise_widens_the_statistics_as_it_widens_the_data(flights):
-    windows, noise = index(flights), 1e-3
+def test_noise_widens_the_statistics_as_it_widens_the_data(slides):
+    windows, noise = index(slides), 1e-3
     plain, noisy = statistics(windows), statistics(windows, noise_std=noise)
     assert noisy.velocity_std == pytest.approx(np.hypot(plain.velocity_std, noise / DT), rel=1e-3)
     assert noisy.acceleration_std == pytest.approx(
@@ -116,8 +116,8 @@ def test_noise_widens_the_statistics_as_it_widens_the_data(flights):
 # -- batches ---------------------------------------------------------------------------------------
 
 
-def test_draws_are_shared_out_evenly_and_repeat(flights):
-    windows = index(flights)
+def test_draws_are_shared_out_evenly_and_repeat(slides):
+    windows = index(slides)
     about = statistics(windows)
 
     def parts(step):
@@ -139,8 +139,8 @@ def test_draws_are_shared_out_evenly_and_repeat(flights):
     assert 0.3 < np.mean(flips) < 0.7
 
 
-def test_expected_edges_are_near_the_real_ones(flights):
-    windows = index(flights)
+def test_expected_edges_are_near_the_real_ones(slides):
+    windows = index(slides)
     about = statistics(windows)
     parts = draw(
         windows,
@@ -157,8 +157,8 @@ def test_expected_edges_are_near_the_real_ones(flights):
     assert real == pytest.approx(sum(d.edges for d in parts[0]), rel=0.1)
 
 
-def test_a_rank_gets_a_window_even_if_it_is_too_large(flights):
-    windows = index(flights)
+def test_a_rank_gets_a_window_even_if_it_is_too_large(slides):
+    windows = index(slides)
     parts = draw(
         windows,
         np.random.default_rng(0),
@@ -217,8 +217,8 @@ def test_the_target_is_corrected_for_the_noise(free_flight):
     assert found == pytest.approx((noise_std / DT**2) ** 2, rel=0.25)
 
 
-def test_push_forward_and_backprop_agree_on_one_step_only(flights):
-    windows = index(flights)
+def test_push_forward_and_backprop_agree_on_one_step_only(slides):
+    windows = index(slides)
     net = model()
     statistics(windows).apply(net)
     rng = np.random.default_rng(0)

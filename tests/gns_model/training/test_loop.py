@@ -39,7 +39,7 @@ def same_state(a: Path, b: Path) -> bool:
     return all(torch.equal(one[key], two[key]) for key in one)
 
 
-def test_a_run_leaves_a_simulator_that_runs(tiny, tmp_path, flights):
+def test_a_run_leaves_a_simulator_that_runs(tiny, tmp_path, slides):
     folder = train(Recipe.from_dict(tiny), tmp_path / "run")
     assert folder == tmp_path / "run" / "model"
     names = {p.name for p in (tmp_path / "run").iterdir()}
@@ -51,8 +51,8 @@ def test_a_run_leaves_a_simulator_that_runs(tiny, tmp_path, flights):
     card = simulator.card
     assert card["trained_on"]["steps"] == 6
     assert card["validation"]["score"] > 0
-    assert simulator.config.limits.max_speed == pytest.approx((1.4**2 + 0.05) ** 0.5)
-    truth = Trajectory.load(flights / "000.h5")
+    assert simulator.config.limits.max_speed == pytest.approx((1.4**2 + 0.01) ** 0.5)
+    truth = Trajectory.load(slides / "000.h5")
     result = simulator.rollout([truth.scene])[0]
     assert result.positions.shape == (11, 64, 3)
     # The saved weights are the moving average, not the last ones.
@@ -63,8 +63,8 @@ def test_a_run_leaves_a_simulator_that_runs(tiny, tmp_path, flights):
     assert not torch.equal(last[key], state[f"model.{key}"])
 
 
-def test_training_learns_to_land(tiny, tmp_path):
-    """Grains that stop at the floor: some hundred steps later rollouts end near the truth."""
+def test_training_learns_a_law_of_motion(tiny, tmp_path):
+    """Grains slow down at a rate that the network has to find; then rollouts end near the truth."""
 
     def last_validation(steps: int) -> dict[str, float]:
         values = {**tiny, "steps": steps, "unroll_fraction": 0.2, "validate_minutes": 0.02}
@@ -78,8 +78,7 @@ def test_training_learns_to_land(tiny, tmp_path):
 
     untrained, trained = last_validation(1), last_validation(250)
     assert trained["centroid_travel"] < 0.1 < untrained["centroid_travel"]
-    assert trained["score"] < 0.5 * untrained["score"]
-    assert trained["one_step"] < untrained["one_step"]
+    assert trained["one_step"] < 0.3 * untrained["one_step"]
     assert trained["diverged"] == 0
 
 

@@ -1,0 +1,136 @@
+"""Step after step: the loop of a rollout, once for speed and once for gradients."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint as rematerialise
+
+from gns_model.learned.config import ModelConfig
+from gns_model.learned.divergence import astray, speed_limit
+from gns_model.learned.model import LearnedModel
+from gns_model.learned.start import start
+from gns_model.learned.world import World
+from gns_model.particles import Points
+from gns_model.scene import Scene
+from gns_model.simulator import Progress
+
+
+def frame_count(config: ModelConfig, scene: Scene) -> int:
+    """Number of frames of a rollout of `scene`, the start included."""
+    return 1 + max(1, math.floor(scene.duration / config.dt + 1e-6))
+
+
+@torch.inference_mode()
+def roll_out(
+    model: LearnedModel, scenes: Sequence[Scene], points: Sequence[Points], advance: Progress
+) -> tuple[list[np.ndarray], dict[int, int]]:
+    """Run scenes as one block-diagonal batch.
+
+    Args:
+        points: the moving points of each scene at t = 0.
+        advance: called with the fraction done.
+
+    Returns:
+        positions [m] of the moving points of each scene, (T, N, D) float32; and, of the scenes
+        that diverged, the first frame that was not good any more: from there on the last good one
+        is repeated.
+    """
+    config, place = model.config, _place(model)
+    moving = [len(p.positions) for p in points]
+    frames = [frame_count(config, scene) for scene in scenes]
+    out = [np.empty((t, n, config.dim), np.float32) for t, n in zip(frames, moving, strict=True)]
+    diverged: dict[int, int] = {}
+    histories, types = start(config, scenes, points, **place)
+    for k, history in enumerate(histories):
+        out[k][0] = history[: moving[k], -1].cpu().numpy()
+    longest = torch.tensor([speed_limit(s) * config.dt for s in scenes], **place)
+
+    running = list(range(len(scenes)))
+    window = torch.cat(histories)
+    world = _world(scenes, types, place)
+    for frame in range(1, max(frames)):
+        after = model.step(window, world)
+        bad = astray(window[:, -1], after, world, longest[running])
+        window = torch.cat([window[:, 1:], after[:, None]], dim=1)
+        sizes = [len(types[k]) for k in running]
+        going = []
+        for slot, (k, rows) in enumerate(zip(running, after.split(sizes), strict=True)):
+            if slot in bad:
+                diverged[k] = frame
+                out[k][frame:] = out[k][frame - 1]
+                continue
+            out[k][frame] = rows[: moving[k]].cpu().numpy()
+            if frame + 1 < frames[k]:
+                going.append(slot)
+        if not going:
+            break
+        if len(going) < len(running):
+            # Scenes that ended or diverged leave the batch; the rest do not notice.
+            parts = window.split(sizes)
+            window = torch.cat([parts[slot] for slot in going])
+            running = [running[slot] for slot in going]
+            world = _world([scenes[k] for k in running], [types[k] for k in running], place)
+        advance(frame / (max(frames) - 1))
+    advance(1.0)
+    return out, diverged
+
+
+def roll_out_tensor(
+    model: LearnedModel,
+    scenes: Sequence[Scene],
+    points: Sequence[Points],
+    centres: Sequence[Tensor] | None,
+    *,
+    frames: int | None,
+    checkpoint: bool,
+    noise: Sequence[Tensor] | None,
+) -> list[Tensor]:
+    """As `LearnedSimulator.rollout_tensor`, which see."""
+    config, place = model.config, _place(model)
+    moving = [len(p.positions) for p in points]
+    lengths = [frames or frame_count(config, scene) for scene in scenes]
+    histories, types = start(config, scenes, points, centres, **place)
+    if noise is not None:
+        for history, shift, n in zip(histories, noise, moving, strict=True):
+            history[:n] += shift.to(history)[:, None]
+    world = _world(scenes, types, place, centres)
+    depth = config.history + 1
+
+    def step(*past: Tensor) -> Tensor:
+        return model.step(torch.stack(past, dim=1), world)
+
+    track = list(torch.cat(histories).unbind(1))
+    for _ in range(1, max(lengths)):
+        past = track[-depth:]
+        if checkpoint and torch.is_grad_enabled():
+            track.append(rematerialise(step, *past, use_reentrant=False))
+        else:
+            track.append(step(*past))
+    whole = torch.stack(track[depth - 1 :])
+    parts = whole.split([len(h) for h in histories], dim=1)
+    return [p[:t, :n] for p, t, n in zip(parts, lengths, moving, strict=True)]
+
+
+def _place(model: LearnedModel) -> dict:
+    """Device and dtype of the positions: those of the model."""
+    return {"device": model.velocity_std.device, "dtype": model.velocity_std.dtype}
+
+
+def _world(
+    scenes: Sequence[Scene],
+    types: Sequence[Tensor],
+    place: dict,
+    centres: Sequence[Tensor] | None = None,
+) -> World:
+    return World.from_scenes(
+        scenes,
+        [len(kind) for kind in types],
+        centres=centres,
+        particle_type=torch.cat(list(types)),
+        **place,
+    )

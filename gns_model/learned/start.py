@@ -1,0 +1,52 @@
+"""How a rollout begins: what the model sees of the time before the release."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from gns_model.learned.config import ModelConfig
+from gns_model.learned.world import baffle_boxes, baffle_points
+from gns_model.particles import MOVING, STATIONARY, Points
+from gns_model.scene import Scene
+
+
+def start(
+    config: ModelConfig,
+    scenes: Sequence[Scene],
+    points: Sequence[Points],
+    centres: Sequence[Tensor] | None = None,
+    *,
+    device: torch.device | str = "cpu",
+    dtype: torch.dtype = torch.float32,
+) -> tuple[list[Tensor], list[Tensor]]:
+    """Histories and particle types of every scene at t = 0.
+
+    Before its release the mass moved as it moves at the release: the history is that motion
+    extended backwards. Kinematic points, if the model wants them, come after the moving ones.
+
+    Args:
+        points: the moving points of each scene, at the spacing of the model.
+        centres: of the baffles, in place of the scenes' own; only kinematic points read it.
+
+    Returns:
+        histories [m], (N, H + 1, D), and particle types, (N,), one of each a scene.
+    """
+    histories, types = [], []
+    past = torch.arange(config.history, -1, -1, dtype=dtype, device=device)
+    for k, (scene, begin) in enumerate(zip(scenes, points, strict=True)):
+        position = torch.tensor(begin.positions, dtype=dtype, device=device)
+        velocity = torch.tensor(begin.velocities, dtype=dtype, device=device)
+        history = position[:, None] - velocity[:, None] * (past * config.dt)[:, None]
+        kind = torch.full((len(position),), MOVING, device=device)
+        if config.baffles == "points":
+            own = centres[k] if centres is not None else None
+            boxes = baffle_boxes(scene, own, device=device, dtype=dtype)
+            fixed = baffle_points(boxes, config.spacing)
+            history = torch.cat([history, fixed[:, None].expand(-1, len(past), -1)])
+            kind = torch.cat([kind, kind.new_full((len(fixed),), STATIONARY)])
+        histories.append(history)
+        types.append(kind)
+    return histories, types
