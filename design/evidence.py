@@ -139,8 +139,8 @@ def choice(run: RunResults, pictures: Pictures) -> str:
             page.picture(
                 *pictures["tradeoff"],
                 "Centroid travel against upstream depth",
-                "Down is a shorter flow, left a shallower one. A line joins what the two simulators "
-                "say of one layout.",
+                "Down is a shorter flow, left a shallower one. A line joins what the two "
+                "simulators say of one layout.",
             )
         )
     layouts = [(d, d.centres) for d in run.designs if d.centres is not None]
