@@ -99,7 +99,8 @@ def smooth_upstream_depth(
     area = measures.WINDOW_LENGTH * size[:, 2:].prod(dim=1)
     mean_depth = weight.sum(dim=-1) * point_volume / area
     gate = torch.sigmoid((mean_depth - measures.LEAST_DEPTH) / (_GATE * temperature))
-    height = (positions[:, None, :, 1] - scene.base).expand_as(weight)
+    half = measures.half_spacing(point_volume, scene.dim)
+    height = (positions[:, None, :, 1] - scene.base + half).expand_as(weight)
     # The phantom keeps the quantile of an empty window defined: it lies on the base.
     height = torch.cat([height, torch.zeros_like(height[..., :1])], dim=-1)
     weight = torch.cat([weight, torch.full_like(weight[..., :1], _PHANTOM)], dim=-1)

@@ -8,7 +8,7 @@ from design import bayes, gradient, hybrid
 from design.baselines import engineering_layouts, random_layouts
 from design.distinct import distance
 from design.gradient import LEAST_STEP, Chain, differentiate
-from design.trials import Outcome, StudyError, TrialLog, sqlite_url, table
+from design.trials import Outcome, StudyError, TrialLog, table
 from gns_env.layout import LayoutSpace
 from gns_env.objective import Objective
 from gns_env.task import BaffleTask
@@ -263,7 +263,7 @@ def test_a_storage_that_cannot_be_opened_is_one_error_without_the_password(stora
 
 def test_a_file_that_is_not_a_database_is_named(tmp_path):
     (tmp_path / "study.db").write_text("not a database, " * 100)
-    with pytest.raises(StudyError, match="study.db"):
+    with pytest.raises(StudyError, match=r"study\.db"):
         campaign(tmp_path)
 
 

@@ -50,8 +50,9 @@ def mirrored(scene: Scene) -> Scene:
         low, up = flip(release)
         velocity = (*release.velocity[:2], -release.velocity[2])
         releases.append({"lower": low, "upper": up, "velocity": velocity})
-    baffles = [{"center": (b.center[0], total - b.center[1]), "size": b.size}
-               for b in scene.baffles]
+    baffles = [
+        {"center": (b.center[0], total - b.center[1]), "size": b.size} for b in scene.baffles
+    ]
     return scene.replace(releases=tuple(releases), baffles=tuple(baffles), placement=None)
 
 
@@ -118,9 +119,7 @@ def test_rest_time_of_a_flow_that_decays(plane_scene: Scene, trajectory_of, by: 
     # exp(-t / tau) = 1%, and the energy decays twice as fast, from the first frame that moves.
     expected = 0.1 * math.log(100) * (0.5 if by == "kinetic_energy" else 1.0)
     assert rest == pytest.approx(expected, abs=0.02)
-    moving = dataclasses.replace(
-        trajectory, positions=positions[:20], time=trajectory.time[:20]
-    )
+    moving = dataclasses.replace(trajectory, positions=positions[:20], time=trajectory.time[:20])
     assert measures.rest_time(moving, by=by) is None
 
 
@@ -134,10 +133,10 @@ def test_depth_is_read_in_the_window_upstream_of_the_face(flume: Scene, trajecto
     trajectory = trajectory_of(heap[None], flume, point_volume=volume)
     depth = measures.upstream_depth_over_time(trajectory)
     assert depth.shape == (1, 3)
-    expected = np.quantile(heap[:, 1] - 0.1, 0.98)
+    expected = np.quantile(heap[:, 1] - 0.1, 0.98) + volume ** (1 / 3) / 2
     np.testing.assert_allclose(depth, [[expected, 0, 0]])
     np.testing.assert_allclose(
-        measures.upstream_depth_over_time(trajectory, quantile=0.5)[0, 0], 0.1, atol=0.011
+        measures.upstream_depth_over_time(trajectory, quantile=0.5)[0, 0], 0.11, atol=0.011
     )
     # Just beside, behind or too far upstream of the window nothing is seen.
     for offset in ([0, 0, 0.16], [0.11, 0, 0], [-0.11, 0, 0]):
@@ -147,6 +146,18 @@ def test_depth_is_read_in_the_window_upstream_of_the_face(flume: Scene, trajecto
     far = dataclasses.replace(trajectory, positions=heap[None] + [-0.1, 0, 0])
     assert measures.upstream_depth_over_time(far, window=0.2)[0, 0] == pytest.approx(expected)
     assert measures.summary(trajectory)["upstream_depth"] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("spacing", [0.05, 0.025, 0.0125])
+def test_depth_of_a_block_is_its_height_at_any_spacing(flume: Scene, trajectory_of, spacing):
+    block = fill(
+        flume.replace(
+            releases=({"lower": (0.4, 0.1, 0.25), "upper": (0.7, 0.3, 0.5), "velocity": (0, 0, 0)},)
+        ),
+        spacing,
+    )
+    trajectory = trajectory_of(block.positions[None], flume, point_volume=block.volume)
+    assert measures.summary(trajectory)["upstream_depth"] == pytest.approx(0.2)
 
 
 def test_a_thin_spray_is_no_depth(flume: Scene, trajectory_of):
@@ -173,7 +184,8 @@ def test_depth_agrees_with_the_definition_spelled_out(flume: Scene, trajectory_o
                 & (frame[:, 2] >= lower[2]) & (frame[:, 2] <= upper[2])
             )  # fmt: skip
             enough = inside.sum() * volume >= 0.02 * length * 0.15
-            expected = np.quantile(frame[inside, 1] - 0.1, 0.98) if enough else 0.0
+            tops = np.clip(frame[inside, 1] - 0.1 + volume ** (1 / 3) / 2, 0, 0.8)
+            expected = np.quantile(tops, 0.98) if enough else 0.0
             assert depth[t, b] == pytest.approx(expected, abs=1e-9)
 
 
@@ -188,7 +200,8 @@ def test_free_depth_tiles_the_placement_area(flume: Scene, trajectory_of, seed: 
         x, z = 0.6 + 0.1 * i, 0.1 + 0.15 * k
         inside = (frame[:, 0] >= x) & (frame[:, 0] < x + 0.1)
         inside &= (frame[:, 2] >= z) & (frame[:, 2] < z + 0.15)
-        expected = np.quantile(frame[inside, 1] - 0.1, 0.98) if inside.any() else 0.0
+        tops = np.clip(frame[inside, 1] - 0.1 + 0.05, 0, 0.8)
+        expected = np.quantile(tops, 0.98) if inside.any() else 0.0
         assert depth[2, 12 * i + k] == pytest.approx(expected, abs=1e-9)
 
 
@@ -289,9 +302,7 @@ def test_position_error(plane_scene: Scene, trajectory_of):
 # -- laws ------------------------------------------------------------------------------------------
 
 
-@given(
-    st.integers(0, 10_000), st.lists(st.floats(-3, 3), min_size=3, max_size=3)
-)
+@given(st.integers(0, 10_000), st.lists(st.floats(-3, 3), min_size=3, max_size=3))
 def test_measures_do_not_see_where_the_scene_is(flume: Scene, trajectory_of, seed, offset):
     cloud = random_cloud(flume, seed)
     here = measures.summary(trajectory_of(cloud, flume))

@@ -64,7 +64,7 @@ def test_a_deep_heap_has_its_depth(flume: Scene):
         torch.quantile(frame[there, 1] - 0.1, 0.98)
         for frame, there in zip(cloud, inside, strict=True)
     ]
-    hard = float(max(depths))
+    hard = float(max(depths)) + 1e-4 ** (1 / 3) / 2
     assert float(smooth["upstream_depth"]) == pytest.approx(hard, abs=0.03)
 
 

@@ -169,7 +169,7 @@ def test_other_ways_to_train_run(tiny, tmp_path, options):
 
 @pytest.mark.slow
 def test_two_ranks_resume_bit_exactly_and_average_their_gradients(tiny, tmp_path):
-    values = {**tiny, "schedule": "exponential", "unroll_fraction": 0.0}
+    values = {**tiny, "schedule": "exponential", "unroll_fraction": 0.0, "valid": []}
     whole = write_recipe(tmp_path / "whole.toml", values)
     half = write_recipe(tmp_path / "half.toml", {**values, "steps": 3})
     assert launch(whole, tmp_path / "whole", 2) == 0
@@ -177,7 +177,7 @@ def test_two_ranks_resume_bit_exactly_and_average_their_gradients(tiny, tmp_path
     assert launch(whole, tmp_path / "parts", 2) == 0
     assert same_state(tmp_path / "whole", tmp_path / "parts")
     # One rank sees other batches and so ends elsewhere.
-    assert launch(whole, tmp_path / "alone", 1) == 0
+    train(Recipe.from_toml(whole), tmp_path / "alone")
     assert not same_state(tmp_path / "whole", tmp_path / "alone")
 
 

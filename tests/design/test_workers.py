@@ -1,0 +1,77 @@
+"""One pool of spawned processes for the whole file: starting one takes seconds."""
+
+import os
+import time
+
+import pytest
+
+from design.workers import WorkerError, Workers, as_completed, report
+from gns_model.errors import SceneError
+
+
+def double(x, slot):
+    return 2 * x, os.environ["OMP_NUM_THREADS"], os.getpid()
+
+
+def half_way(slot):
+    report(slot)(0.5)
+    time.sleep(1.5)
+    return "done"
+
+
+def refuse(slot):
+    raise SceneError("a scene that cannot be")
+
+
+def die(slot):
+    os._exit(1)
+
+
+@pytest.fixture(scope="module")
+def workers():
+    with Workers(2) as pool:
+        yield pool
+
+
+def test_jobs_run_in_processes_of_one_thread_and_come_back_by_index(workers):
+    jobs = [workers.submit(double, k) for k in range(6)]
+    seen = {k: jobs[k].result() for k in as_completed(jobs)}
+    assert {k: value[0] for k, value in seen.items()} == {k: 2 * k for k in range(6)}
+    assert {value[1] for value in seen.values()} == {"1"}
+    assert os.getpid() not in {value[2] for value in seen.values()}
+
+
+def test_a_job_tells_how_far_it_is(workers):
+    job, looks = workers.submit(half_way), []
+    for _ in as_completed([job], lambda: looks.append(job.fraction)):
+        pass
+    assert 0.5 in looks
+    assert job.fraction == 1.0
+    assert job.result() == "done"
+
+
+def test_an_error_of_a_job_comes_back_as_it_was(workers):
+    with pytest.raises(SceneError, match="cannot be"):
+        workers.submit(refuse).result()
+    assert workers.submit(double, 1).result()[0] == 2
+
+
+def test_a_process_that_dies_is_one_clear_error():
+    with Workers(1) as pool:
+        with pytest.raises(WorkerError, match="--resume"):
+            pool.submit(die).result()
+        with pytest.raises(WorkerError):
+            pool.submit(double, 1)
+
+
+def test_leaving_by_an_interrupt_ends_the_work_at_once():
+    def work_and_interrupt():
+        with Workers(1) as pool:
+            for _ in range(200):
+                pool.submit(half_way)
+            raise KeyboardInterrupt
+
+    started = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        work_and_interrupt()
+    assert time.monotonic() - started < 60  # and not 200 jobs of 1.5 s
