@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 STEP = 0.03
 #: Steps shorter than this end a chain [m]: less than anybody builds to.
 LEAST_STEP = 0.003
+#: A chain ends where the constraints take all but this share of its step.
+HELD = 0.02
 #: Decay of Adam's running means; short memories, since a chain has few steps.
 BETA_MEAN, BETA_SQUARE = 0.7, 0.9
 #: Chains of a pure gradient search.
@@ -125,10 +127,19 @@ class Chain:
                     return
                 self.centres, gradient = self._best, self._best_gradient
         assert gradient is not None
-        moved = self._space.project(self.centres - self._direction(gradient))
-        if np.abs(moved - self.centres).max() < LEAST_STEP / 10:
-            self.step = 0.0  # held by the constraints: a local optimum
-        self.centres = np.asarray(moved, dtype=float)
+        self._move(self._direction(gradient))
+
+    def _move(self, step: np.ndarray) -> None:
+        """Go against `step` [m], shape (n, D-1), as far as the constraints allow."""
+        moved = self._space.project(self.centres - step) - self.centres
+        most = np.abs(moved).max()
+        if most < HELD * self.step:
+            self.step = 0.0  # a local optimum
+            return
+        if most < self.step / 2:
+            # What is held had set the scale: go on along what the constraints leave free.
+            moved = self._space.project(self.centres + moved * (self.step / most)) - self.centres
+        self.centres = self.centres + moved
 
     def _direction(self, gradient: np.ndarray) -> np.ndarray:
         self._count += 1

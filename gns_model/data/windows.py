@@ -158,9 +158,8 @@ class WindowIndex:
         try:
             with open_trajectory(entry.path) as file:
                 positions = file["positions"]
-                for k, f in enumerate(frames):
-                    if f >= 0:
-                        out[:, k] = positions[f][chosen]
+                for k in np.flatnonzero(frames >= 0):
+                    out[:, k] = positions[frames[k]][chosen]
                 if frames[0] < 0:
                     start = positions[0][chosen]
                     velocity = entry.initial_velocity()[chosen]

@@ -239,6 +239,18 @@ def test_a_chain_stops_at_a_constraint():
     assert chain.step == 0
 
 
+def test_a_chain_slides_along_a_constraint():
+    space = LayoutSpace(formula_scene(), 1)
+    bottom = np.array([[0.2, 0.9]])  # out of bounds upstream: the best there is lies at the edge
+    chain, steps = Chain(space, np.array([[0.7, 0.4]])), 0
+    while chain.step >= LEAST_STEP and steps < 200:
+        offset = chain.centres - bottom
+        chain.learn(Outcome(float((offset**2).sum()), {}, gradient=2 * offset))
+        steps += 1
+    assert steps < 200
+    np.testing.assert_allclose(chain.centres, [[space.lower[0], 0.9]], atol=0.03)
+
+
 # -- the log ---------------------------------------------------------------------------------------
 
 
