@@ -49,8 +49,10 @@ def numpy_rate(scene, repeats=3):
 
 
 def main():
-    cases = {"2D column a = 1": (paper.column_scene(paper.COLUMNS[2]), 0.3),
-             "3D flume": (paper.flume_scene(), 0.1)}
+    cases = {
+        "2D column a = 1": (paper.column_scene(paper.COLUMNS[2]), 0.3),
+        "3D flume": (paper.flume_scene(), 0.1),
+    }
     for name, (scene, duration) in cases.items():
         ours, plain = solver_rate(scene, duration), numpy_rate(scene)
         print(

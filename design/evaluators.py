@@ -143,8 +143,7 @@ class KnownReference:
         given = [scene for scene in scenes if scene.baffles]
         rolled = iter(self._simulator.rollout(given, progress=progress) if given else [])
         return [
-            next(rolled) if scene.baffles else Trajectory.load(self._reference)
-            for scene in scenes
+            next(rolled) if scene.baffles else Trajectory.load(self._reference) for scene in scenes
         ]
 
     def check(self, scene: Scene) -> None:

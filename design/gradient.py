@@ -210,9 +210,7 @@ def _outcome(
     )
     values = hard.summary(trajectory)
     cost = task.objective.cost(values, task.reference)
-    return Outcome(
-        cost, values, OK, rollouts=1, backwards=1, seconds=seconds, gradient=gradient
-    )
+    return Outcome(cost, values, OK, rollouts=1, backwards=1, seconds=seconds, gradient=gradient)
 
 
 def _plausible(frames: np.ndarray, scene: Scene) -> bool:

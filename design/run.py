@@ -51,6 +51,7 @@ from gns_env.layout import LayoutSpace
 from gns_env.task import BaffleTask
 from gns_model.console import progress_bar
 from gns_model.errors import SimulatorError
+from gns_model.particles import fill
 from gns_model.scene import Scene
 
 if TYPE_CHECKING:
@@ -79,16 +80,17 @@ def optimise(
             was finished stands in the run folder then, and `Settings.resume` goes on from it.
     """
     run = Run(scene, Path(out), settings or Settings(), command)
-    with storage_errors(run.storage), progress_bar(quiet=quiet) as bar:
+    with storage_errors(run.storage):
         run.open()
-        with Workers(run.workers) as workers:
-            try:
-                run.simulate(workers, bar)
-            except BaseException:
-                with contextlib.suppress(Exception):  # the first error is the one to tell
-                    run.write(INTERRUPTED)
-                raise
-        run.publish(bar)
+        with progress_bar(quiet=quiet) as bar:
+            with Workers(run.workers) as workers:
+                try:
+                    run.simulate(workers, bar)
+                except BaseException:
+                    with contextlib.suppress(Exception):  # the first error is the one to tell
+                        run.write(INTERRUPTED)
+                    raise
+            run.publish(bar)
         run.log.close()
     return run.summary
 
@@ -320,9 +322,7 @@ class Run:
         own = [] if self.paper is None else [self.paper.centres]
         return candidates(self.log.trials(), count, least, avoid=own)
 
-    def _verify(
-        self, store: RolloutStore, references: dict[str, Pending], watch: Watch
-    ) -> None:
+    def _verify(self, store: RolloutStore, references: dict[str, Pending], watch: Watch) -> None:
         s = self.settings
         chosen = self._candidates(s.verify)
         scenes = [self.bare.with_baffles(judged.centres) for judged in chosen]
@@ -379,7 +379,11 @@ def _check(scene: Scene, settings: Settings) -> list[str]:
     for spec in (settings.simulator, *([settings.verifier] if settings.verify else [])):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            spec.load().check(scene)
+            simulator = spec.load()
+            simulator.check(scene)
+            spacing = getattr(simulator, "spacing", None)
+            if spacing is not None:
+                fill(scene, spacing)  # a release thinner than that: say so before the search
         notes += [str(warning.message) for warning in caught]
     return notes
 

@@ -67,9 +67,7 @@ class RolloutStore:
         self.folder, self._workers = Path(folder), workers
         (self.folder / "rollouts").mkdir(parents=True, exist_ok=True)
 
-    def start(
-        self, spec: SimulatorSpec, scene: Scene, *, trajectory: bool = True
-    ) -> Pending:
+    def start(self, spec: SimulatorSpec, scene: Scene, *, trajectory: bool = True) -> Pending:
         """Have `scene` simulated in a worker (on a GPU: here and now), unless it was before.
 
         `trajectory`: measures alone are not enough."""

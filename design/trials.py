@@ -273,9 +273,7 @@ def storage_errors(storage: str) -> Iterator[None]:
 def _backend(storage: str) -> optuna.storages.RDBStorage:
     if not storage.startswith("sqlite"):
         return optuna.storages.RDBStorage(storage, engine_kwargs={"pool_pre_ping": True})
-    backend = optuna.storages.RDBStorage(
-        storage, engine_kwargs={"connect_args": {"timeout": 60}}
-    )
+    backend = optuna.storages.RDBStorage(storage, engine_kwargs={"connect_args": {"timeout": 60}})
 
     def tune(connection: Any, _: Any) -> None:
         # A trial is about ten commits, each a wait for the disk (30 ms on a busy one) unless the
@@ -328,6 +326,4 @@ def _same_task(known: dict[str, Any], asked: dict[str, Any]) -> None:
             detail = (
                 "" if isinstance(asked[key], dict) else f" ({known.get(key)!r}, now {asked[key]!r})"
             )
-            raise StudyError(
-                f"the study to resume has another {key}{detail}: choose another --out"
-            )
+            raise StudyError(f"the study to resume has another {key}{detail}: choose another --out")

@@ -176,7 +176,12 @@ class Comparison:
         text = io.StringIO(newline="")
         writer = csv.writer(text)
         extra = (
-            "status", "points", "points_inside", "point_rmse", "deposit_error", "seconds",
+            "status",
+            "points",
+            "points_inside",
+            "point_rmse",
+            "deposit_error",
+            "seconds",
             "reference_seconds",
         )
         names = list(measures.UNITS)

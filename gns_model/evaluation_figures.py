@@ -97,7 +97,12 @@ def _plan(
     x, z = scene.domain.lower[0], scene.domain.lower[2]
     extent = (x, x + values.shape[0] * CELL, z, z + values.shape[1] * CELL)
     axes.imshow(
-        values.T, origin="lower", extent=extent, cmap=colours, vmin=low, vmax=high,
+        values.T,
+        origin="lower",
+        extent=extent,
+        cmap=colours,
+        vmin=low,
+        vmax=high,
         interpolation="nearest",
     )
     for lower, upper in scene.baffle_boxes():
@@ -111,8 +116,9 @@ def _plan(
 def _profiles(comparison: Comparison, path: str | os.PathLike[str], scenes: int) -> None:
     results = comparison.results[:scenes]
     figure = Figure(figsize=(9, 2.6 * len(results) + 0.4), layout="constrained")
-    for axes, result in zip(figure.subplots(len(results), 1, squeeze=False)[:, 0], results,
-                            strict=True):
+    for axes, result in zip(
+        figure.subplots(len(results), 1, squeeze=False)[:, 0], results, strict=True
+    ):
         x = result.scene.domain.lower[0] + CELL * (np.arange(len(result.deposit)) + 0.5)
         axes.plot(x, result.reference_deposit, color="0.4", label=comparison.reference)
         axes.plot(x, result.deposit, color="#c2571a", label=comparison.simulator)

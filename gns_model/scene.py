@@ -58,9 +58,7 @@ class Box(_Part):
         if len(self.lower) != len(self.upper):
             raise ValueError(f"lower has {len(self.lower)} numbers and upper {len(self.upper)}")
         if any(u - lo <= TOLERANCE for lo, u in zip(self.lower, self.upper, strict=True)):
-            raise ValueError(
-                f"every upper must exceed its lower, got {self.lower} to {self.upper}"
-            )
+            raise ValueError(f"every upper must exceed its lower, got {self.lower} to {self.upper}")
         return self
 
     @property
@@ -144,9 +142,7 @@ class Baffle(_Part):
         half = (self.size[0] / 2, *(s / 2 for s in self.size[2:]))
         low = [c - h for c, h in zip(self.center, half, strict=True)]
         high = [c + h for c, h in zip(self.center, half, strict=True)]
-        return Box(
-            lower=(low[0], base, *low[1:]), upper=(high[0], base + self.size[1], *high[1:])
-        )
+        return Box(lower=(low[0], base, *low[1:]), upper=(high[0], base + self.size[1], *high[1:]))
 
 
 class Placement(_Part):
@@ -168,9 +164,7 @@ class Placement(_Part):
         if len(self.upper) != n or any(
             u <= lo for lo, u in zip(self.lower, self.upper, strict=True)
         ):
-            raise ValueError(
-                f"every upper must exceed its lower, got {self.lower} to {self.upper}"
-            )
+            raise ValueError(f"every upper must exceed its lower, got {self.lower} to {self.upper}")
         if self.size is not None and (len(self.size) != n + 1 or min(self.size) <= 0):
             raise ValueError(f"size needs {n + 1} positive numbers, got {self.size}")
         for k, r in enumerate(self.keep_out):
@@ -273,11 +267,9 @@ class Scene(_Part):
                     f"{self.placement.lower}, {self.placement.upper}"
                 )
             if any(
-                p < d - TOLERANCE
-                for p, d in zip(self.placement.lower, plan_lower, strict=True)
+                p < d - TOLERANCE for p, d in zip(self.placement.lower, plan_lower, strict=True)
             ) or any(
-                p > d + TOLERANCE
-                for p, d in zip(self.placement.upper, plan_upper, strict=True)
+                p > d + TOLERANCE for p, d in zip(self.placement.upper, plan_upper, strict=True)
             ):
                 raise ValueError(
                     f"placement {self.placement.lower} to {self.placement.upper} leaves the "
@@ -343,9 +335,7 @@ class Scene(_Part):
         if centres.size == 0:
             centres = np.zeros((0, self.dim - 1))
         if centres.ndim != 2 or centres.shape[1] != self.dim - 1:
-            raise SceneError(
-                f"centres must have shape (n, {self.dim - 1}), got {centres.shape}"
-            )
+            raise SceneError(f"centres must have shape (n, {self.dim - 1}), got {centres.shape}")
         if not np.isfinite(centres).all():
             raise SceneError(f"centres must be finite, got {centres.tolist()}")
         size = tuple(size) if size is not None else (self.baffle_size if len(centres) else ())

@@ -58,8 +58,7 @@ def load_simulator(name: str | os.PathLike[str], device: str = "cpu", **options:
     if not str(name) or not path.exists():
         known = ", ".join(["mpm", *sorted(shipped)])
         raise SimulatorError(
-            f"no simulator named {str(name)!r}: give {known}, or the "
-            "path of a checkpoint folder"
+            f"no simulator named {str(name)!r}: give {known}, or the path of a checkpoint folder"
         )
     _check_options(load_model, path, device=device, **options)
     return load_model(path, device=device, **options)

@@ -135,9 +135,7 @@ def open_trajectory(path: str | os.PathLike[str]) -> h5py.File:
             raise FileFormatError(f"{path}: an HDF5 file, but not a {FORMAT} file")
         version = _read(file, "version", int)
         if version > VERSION:
-            raise FileFormatError(
-                f"{path}: version {version}, this program reads up to {VERSION}"
-            )
+            raise FileFormatError(f"{path}: version {version}, this program reads up to {VERSION}")
         frames = _read(file, "frames", int)
         shapes = {name: file[name].shape for name in ("positions", "time", "particle_type")}
         points = shapes["positions"][1:2]
@@ -158,7 +156,14 @@ def open_trajectory(path: str | os.PathLike[str]) -> h5py.File:
 
 #: What HDF5, JSON and NumPy raise on damaged content.
 _DAMAGE = (
-    OSError, KeyError, IndexError, ValueError, TypeError, RuntimeError, MemoryError, AttributeError,
+    OSError,
+    KeyError,
+    IndexError,
+    ValueError,
+    TypeError,
+    RuntimeError,
+    MemoryError,
+    AttributeError,
 )
 
 

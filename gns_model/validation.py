@@ -103,9 +103,9 @@ def depth_by_definition(trajectory: Trajectory) -> dict[str, float]:
     """
     return {
         f"window {window:.2f} m, quantile {quantile:g}": float(
-            measures.upstream_depth_over_time(
-                trajectory, window=window, quantile=quantile
-            ).max(initial=0.0)
+            measures.upstream_depth_over_time(trajectory, window=window, quantile=quantile).max(
+                initial=0.0
+            )
         )
         for window in (0.03, 0.05, 0.10)
         for quantile in (0.90, 0.98, 1.0)

@@ -1,4 +1,4 @@
-"""Make a dataset: many scenes, one process each, one file each; a rerun goes on where it stopped."""
+"""Make a dataset: many scenes, a process and a file each; a rerun goes on where it stopped."""
 
 from __future__ import annotations
 
@@ -83,8 +83,7 @@ def generate(
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(workers, len(missing)), mp_context=context) as pool:
         jobs = {
-            pool.submit(_make, paths[i], family, seed, i, spacing, frame_interval)
-            for i in missing
+            pool.submit(_make, paths[i], family, seed, i, spacing, frame_interval) for i in missing
         }
         try:
             while jobs:

@@ -124,6 +124,10 @@ class WindowIndex:
     def _stride(self, source: Source) -> int:
         return _multiple(self.dt, source.interval, source.path, "frame interval", "s")
 
+    def stride(self, source: int) -> int:
+        """Frames of a file in one step of the model."""
+        return self._stride(self.sources[source])
+
     def residues(self, source: int) -> int:
         """Number of tracer sets in a file, ratio^D."""
         return int(self.sources[source].residue.max()) + 1

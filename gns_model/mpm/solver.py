@@ -59,17 +59,18 @@ class MpmSimulator:
         workers: int = 1,
         damping_rate: float = DAMPING_RATE,
     ) -> None:
-        for key, value in dict(frame_interval=frame_interval, cfl=cfl, threads=threads, workers=workers).items():
-            if not value > 0:
-                raise SimulatorError(f"{key} must be positive, got {value}")
-        if spacing is not None and not spacing > 0:
-            raise SimulatorError(f"spacing must be positive, got {spacing}")
         self.spacing = spacing
         self.frame_interval = frame_interval
         self.cfl = cfl
         self.threads = threads
         self.workers = workers
         self.damping_rate = damping_rate
+        for key in ("spacing", "frame_interval", "cfl", "threads", "workers"):
+            value = getattr(self, key)
+            if value is not None and not value > 0:
+                raise SimulatorError(f"{key} must be positive, got {value}")
+        if not damping_rate >= 0:
+            raise SimulatorError(f"damping_rate must not be negative, got {damping_rate}")
 
     def settings(self) -> dict[str, Any]:
         """The arguments that this simulator was made with."""

@@ -227,8 +227,9 @@ def clear_grid(grid, lattice, bounds):
 
 @njit(parallel=True, cache=True)
 def grid_to_points(
-    points, grid, lattice, layers, starts, keep, constants, boxes, mu_baffles, lower, upper, dt, speeds
-):
+    points, grid, lattice, layers, starts, keep, constants, boxes, mu_baffles,
+    lower, upper, dt, speeds,
+):  # fmt: skip
     """Gather velocities, advect, resolve contact with baffles exactly, advance the stress.
 
     `keep` is the share of its own velocity that a point keeps in this substep. `speeds` receives
@@ -295,8 +296,8 @@ def grid_to_points(
             for c in range(9):
                 points[p, AFFINE + c] = gradient[c]
             strain = points[p, STRAIN] + dt * (gradient[0] + gradient[4] + gradient[8])
-            # Grains that part carry no more strain than the tension cutoff: kept in full, a gap that
-            # one point has gathered by noise leaves half of a settled deposit without stress.
+            # Grains that part carry no more strain than the tension cutoff. Kept in full, gaps that
+            # points gather by noise leave half of a settled deposit without stress.
             strain = min(strain, constants.tension / constants.bulk)
             points[p, STRAIN] = strain
             (
@@ -330,9 +331,7 @@ def grid_to_points(
                     pz, nvz = lower[2], max(nvz, 0.0)
                 elif pz > upper[2]:
                     pz, nvz = upper[2], min(nvz, 0.0)
-            moved = max(
-                abs(px - points[p, 0]), max(abs(py - points[p, 1]), abs(pz - points[p, 2]))
-            )
+            moved = max(abs(px - points[p, 0]), max(abs(py - points[p, 1]), abs(pz - points[p, 2])))
             fastest = max(fastest, moved)
             points[p, 0], points[p, 1], points[p, 2] = px, py, pz
             points[p, 3], points[p, 4], points[p, 5] = nvx, nvy, nvz
@@ -364,9 +363,7 @@ def advance(
                         points, grid, lattice, layers, starts, order,
                         colours[colour], colours[colour + 1], mass, volume, dt,
                     )  # fmt: skip
-            update_grid(
-                grid, lattice, bounds, gravity, mu_base, mu_walls, mu_baffles, solid, dt
-            )
+            update_grid(grid, lattice, bounds, gravity, mu_base, mu_walls, mu_baffles, solid, dt)
             grid_to_points(
                 points, grid, lattice, layers, starts, keep, constants, boxes, mu_baffles,
                 lower, upper, dt, speeds,

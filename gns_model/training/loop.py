@@ -165,6 +165,7 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: threadin
                 edges_per_batch=recipe.edges_per_batch,
                 statistics=position.statistics,
                 mirror=recipe.mirror,
+                early=recipe.early,
                 unroll=steps,
             )[ranks.rank]
             batch = batches.collate(
@@ -183,6 +184,7 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: threadin
                     steps=steps,
                     backprop=recipe.backprop_through_unroll,
                     linear_beyond=recipe.linear_beyond,
+                    momentum_weight=recipe.momentum_weight,
                 )
             optimiser.zero_grad(set_to_none=True)
             loss.backward()

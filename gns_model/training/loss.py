@@ -19,7 +19,9 @@ def step_error(
     after: Tensor,
     move: Tensor,
     *,
+    batch: Tensor | None = None,
     linear_beyond: float | None = None,
+    momentum_weight: float = 0.0,
 ) -> Tensor:
     """Mean square of the normalised acceleration error, a scalar.
 
@@ -34,13 +36,23 @@ def step_error(
         linear_beyond: where the square turns into a straight line, in standard deviations
             (pseudo-Huber, 2 d² (sqrt(1 + e²/d²) - 1)); default: nowhere. Impacts are rare and
             large: a thousandth of the points holds a quarter of the squares.
+        batch: scene of every point, shape (N,); default: all in one.
+        momentum_weight: of the mean over scenes of the square of a scene's mean error. An error
+            that all points share moves the centroid and hardly shows in the mean of squares.
     """
     error = (after - history[:, -1]) - move
-    square = (error / (model.config.dt**2 * model.acceleration_std)).square()
+    error = error / (model.config.dt**2 * model.acceleration_std)
+    square = error.square()
     if linear_beyond is not None:
         d = linear_beyond**2
         square = 2 * d * ((1 + square / d).sqrt() - 1)
-    return square.mean()
+    if momentum_weight == 0:
+        return square.mean()
+    if batch is None:
+        batch = torch.zeros(len(error), dtype=torch.long, device=error.device)
+    counts = torch.bincount(batch).to(error.dtype)[:, None]
+    mean = error.new_zeros((len(counts), error.shape[1])).index_add(0, batch, error) / counts
+    return square.mean() + momentum_weight * mean.square().mean()
 
 
 def unrolled_loss(
@@ -50,6 +62,7 @@ def unrolled_loss(
     steps: int = 1,
     backprop: bool = False,
     linear_beyond: float | None = None,
+    momentum_weight: float = 0.0,
 ) -> Tensor:
     """Loss after the model has taken `steps` steps on its own, a scalar.
 
@@ -58,8 +71,20 @@ def unrolled_loss(
         backprop: mean of all steps' errors with gradients through all of them. Otherwise
             push-forward (Brandstetter et al. 2022): the first steps only prepare an input with
             the model's own error, and the last one is the loss.
-        linear_beyond: see `step_error`.
+        linear_beyond, momentum_weight: see `step_error`.
     """
+
+    def error(after: Tensor, k: int) -> Tensor:
+        return step_error(
+            model,
+            history,
+            after,
+            batch.moves[:, k],
+            batch=batch.world.batch,
+            linear_beyond=linear_beyond,
+            momentum_weight=momentum_weight,
+        )
+
     history = batch.history
     if not backprop:
         with torch.no_grad():
@@ -67,12 +92,10 @@ def unrolled_loss(
                 after = model.step(history, batch.world)
                 history = torch.cat([history[:, 1:], after[:, None]], dim=1)
         after = model.step(history, batch.world)
-        move = batch.moves[:, steps - 1]
-        return step_error(model, history, after, move, linear_beyond=linear_beyond)
+        return error(after, steps - 1)
     total = batch.moves.new_zeros(())
     for k in range(steps):
         after = model.step(history, batch.world)
-        move = batch.moves[:, k]
-        total = total + step_error(model, history, after, move, linear_beyond=linear_beyond)
+        total = total + error(after, k)
         history = torch.cat([history[:, 1:], after[:, None]], dim=1)
     return total / steps

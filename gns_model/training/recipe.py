@@ -52,6 +52,9 @@ class Recipe(BaseModel):
     weight_decay: NonNegative = 1e-4
     #: Error in standard deviations beyond which the loss grows linearly; none: squares all the way.
     linear_beyond: Positive | None = None
+    #: Weight of the error that all points of a scene share; see `loss.step_error`.
+    momentum_weight: NonNegative = 0.0
+    early: Fraction = 0.0  #: share of windows from the first steps of a rollout
     clip_norm: Positive = 1.0  #: of the whole gradient
     ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.999
     mirror: bool = True  #: show every other window in a mirror across z; 3D only

@@ -143,9 +143,7 @@ def test_a_simulator_that_does_not_answer_to_the_layout_is_found_out(references,
     class Deaf(Slide):
         def rollout(self, scenes, *, progress=None):
             (one,) = super().rollout([scenes[0].with_baffles([])])
-            return [
-                Trajectory(**{**vars(one), "scene": scene}) for scene in scenes
-            ]
+            return [Trajectory(**{**vars(one), "scene": scene}) for scene in scenes]
 
     numbers = compare(Deaf(), references).aggregate()
     assert numbers["centroid_travel.error"] < 0.2

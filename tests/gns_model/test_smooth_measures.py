@@ -96,9 +96,7 @@ def test_gradients_equal_central_differences(request, name: str, key: str):
                 moved[index] += sign * step
                 ends.append(float(value(*moved)))
             numeric = (ends[0] - ends[1]) / 2e-6
-            assert float((gradient * direction).sum()) == pytest.approx(
-                numeric, rel=1e-4, abs=1e-7
-            )
+            assert float((gradient * direction).sum()) == pytest.approx(numeric, rel=1e-4, abs=1e-7)
 
 
 def test_float32_agrees_with_float64(flume: Scene):

@@ -25,7 +25,7 @@ def trajectory(small_flume: Scene, trajectory_of) -> Trajectory:
         positions,
         small_flume,
         status="diverged",
-        settings={"spacing": 0.05, "seconds": 1.25, "note": "ä \" \\ \n"},
+        settings={"spacing": 0.05, "seconds": 1.25, "note": 'ä " \\ \n'},
         lattice=rng.integers(0, 9, (50, 3)).astype(np.int32),
     )
 

@@ -56,9 +56,7 @@ def test_translation_with_the_domain(make_model, make_scene, dim):
     offset = torch.tensor(shift[:dim])
     with torch.no_grad():
         here = model.step(history, world)
-        there = model.step(
-            history + offset, World.from_scenes([moved], [len(history)])
-        )
+        there = model.step(history + offset, World.from_scenes([moved], [len(history)]))
     assert (here + offset - there).abs().max() <= 1e-5
 
 
@@ -69,13 +67,9 @@ def test_mirror_symmetric_features_do_not_favour_a_side(make_model, make_scene):
     scene = make_scene()
     history, world = start(model, scene)
     z = make_scene().domain.upper[2]
-    baffles = [
-        {"center": (b.center[0], z - b.center[1]), "size": b.size} for b in scene.baffles
-    ]
+    baffles = [{"center": (b.center[0], z - b.center[1]), "size": b.size} for b in scene.baffles]
     releases = [{**r.model_dump(), "lower": r.lower, "upper": r.upper} for r in scene.releases]
-    other = World.from_scenes(
-        [make_scene(baffle=baffles, release=releases)], [len(history)]
-    )
+    other = World.from_scenes([make_scene(baffle=baffles, release=releases)], [len(history)])
     mirrored = history.clone()
     mirrored[..., 2] = z - mirrored[..., 2]
     seen = []
@@ -108,9 +102,7 @@ def test_free_flight_is_exact_with_a_silent_network(make_model, make_scene):
     with torch.no_grad():
         for p in far.network.decode.parameters():
             p.zero_()
-    torch.testing.assert_close(
-        far.step(history, world), 2 * history[:, -1] - history[:, -2]
-    )
+    torch.testing.assert_close(far.step(history, world), 2 * history[:, -1] - history[:, -2])
 
 
 def test_step_is_semi_implicit_euler_of_the_denormalised_acceleration(make_model, make_scene):

@@ -218,9 +218,7 @@ def test_centres_and_noise_are_used(make_model, make_scene):
 
 def objective(simulator, scenes, centres, **options):
     tensors = simulator.rollout_tensor(scenes, centres, frames=21, **options)
-    return sum(
-        t[-1, :, 0].mean() + (t[:, :, 1] ** 2).mean() + t[5:, :, -1].mean() for t in tensors
-    )
+    return sum(t[-1, :, 0].mean() + (t[:, :, 1] ** 2).mean() + t[5:, :, -1].mean() for t in tensors)
 
 
 @pytest.mark.parametrize("baffles", ["distance", "points"])

@@ -73,7 +73,8 @@ def test_return_does_not_know_the_axes(stress, angle):
     material = Material(friction_angle=30, cohesion=100, tension_cutoff=50)
     constants = material_constants(material)
     c, s = math.cos(angle), math.sin(angle)
-    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+    about_z = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    turn = about_z @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
     turned = turn @ matrix(stress) @ turn.T
     returned = turn @ matrix(return_stress(*stress, constants)) @ turn.T
     direct = matrix(return_stress(*[turned[i, j] for i, j in COMPONENTS], constants))

@@ -69,12 +69,13 @@ def test_momentum_is_conserved_without_contact(final_points):
     simulator = MpmSimulator(spacing=0.025)
     trajectory = simulator.rollout([colliding])[0]
     points = final_points["points"]
-    first = np.repeat(
-        [r.velocity for r in colliding.releases], [16 * 16, 12 * 20], axis=0
-    ).mean(axis=0)
-    collided = np.abs(points[:, 3:5] - np.repeat(
-        [r.velocity for r in colliding.releases], [16 * 16, 12 * 20], axis=0
-    )).max()
+    first = np.repeat([r.velocity for r in colliding.releases], [16 * 16, 12 * 20], axis=0).mean(
+        axis=0
+    )
+    collided = np.abs(
+        points[:, 3:5]
+        - np.repeat([r.velocity for r in colliding.releases], [16 * 16, 12 * 20], axis=0)
+    ).max()
     assert collided > 0.5, "the blocks never met: the test would show nothing"
     np.testing.assert_allclose(points[:, 3:5].mean(axis=0), first, atol=1e-10)
     np.testing.assert_allclose(
@@ -237,8 +238,13 @@ def test_a_grid_that_cannot_fit_is_refused():
 def test_a_diverged_rollout_is_marked_and_finite():
     # Twenty times the stable substep: the explicit scheme blows up.
     trajectory = MpmSimulator(spacing=0.05, cfl=20.0, frame_interval=0.05).rollout(
-        [scene(domain={"lower": (0.0, 0.0), "upper": (4.0, 2.0)}, duration=1.0,
-               release=[{"lower": (1.0, 0.0), "upper": (1.5, 0.8), "velocity": (3.0, 0.0)}])]
+        [
+            scene(
+                domain={"lower": (0.0, 0.0), "upper": (4.0, 2.0)},
+                duration=1.0,
+                release=[{"lower": (1.0, 0.0), "upper": (1.5, 0.8), "velocity": (3.0, 0.0)}],
+            )
+        ]
     )[0]
     assert np.isfinite(trajectory.positions).all()
     assert trajectory.status == "diverged"

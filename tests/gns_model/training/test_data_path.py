@@ -12,7 +12,7 @@ from gns_model.learned.graph import radius_graph
 from gns_model.learned.model import LearnedModel
 from gns_model.scene import Scene
 from gns_model.training.augment import mirror_positions, mirrored
-from gns_model.training.batches import DRAW, collate, draw, generator, read
+from gns_model.training.batches import DRAW, EARLY_STEPS, collate, draw, generator, read
 from gns_model.training.loss import step_error, unrolled_loss
 from gns_model.training.statistics import measure
 
@@ -245,3 +245,53 @@ def test_the_loss_turns_linear_where_asked(free_flight):
     assert cost(1.0, None) == pytest.approx(1.0, rel=1e-2)
     assert cost(0.5, 10.0) == pytest.approx(0.25, rel=1e-2)
     assert cost(100.0, 2.0) == pytest.approx(2 * 4 * ((1 + 2500) ** 0.5 - 1), rel=1e-2)
+
+
+def test_an_error_that_a_scene_shares_weighs_more(free_flight):
+    net, batch = ballistic(free_flight)
+    history, move = batch.history, batch.moves[:, 0]
+    count = len(history)
+    scene = torch.arange(count) % 2
+    scale = DT**2 * net.acceleration_std
+    exact = history[:, -1] + move
+
+    def cost(error, weight):
+        after = exact + error[:, None] * scale
+        return float(step_error(net, history, after, move, batch=scene, momentum_weight=weight))
+
+    shared = torch.where(scene == 0, 1.0, -1.0)
+    # +1 in every point of one scene, -1 in the other: each scene's mean error is one.
+    assert cost(shared, 3.0) == pytest.approx(1 + 3, rel=1e-2)
+    # +1 and -1 in turn within each scene: the means vanish.
+    order = torch.arange(count) // 2 % 2
+    even = torch.where(order == 0, 1.0, -1.0)
+    even[2 * (count // 4) * 2 :] = 0.0
+    assert cost(even, 1000.0) < 1.2
+
+
+def test_early_windows_are_drawn_as_often_as_asked(slides):
+    windows = index(slides)
+    measured = statistics(windows)
+
+    def share(early):
+        draws = [
+            item
+            for seed in range(150)
+            for item in draw(
+                windows,
+                np.random.default_rng(seed),
+                ranks=1,
+                edges_per_batch=1,
+                statistics=measured,
+                mirror=False,
+                early=early,
+            )[0]
+        ]
+        early_frames = EARLY_STEPS * windows.stride(0)
+        assert all(0 <= item.frame < windows.starts(item.source) for item in draws)
+        return np.mean([item.frame < early_frames for item in draws])
+
+    uniform = share(0.0)
+    assert share(1.0) == 1.0
+    assert share(0.5) == pytest.approx(0.5 + uniform / 2, abs=0.12)
+    assert uniform < 0.8
