@@ -6,7 +6,7 @@ paper's MPM does (2 x 2 x 2 points in an element of twice the spacing).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -39,6 +39,19 @@ class Points:
     def volume(self) -> float:
         """Volume of one point: [m³], in 2D [m²] per metre of width."""
         return self.spacing ** self.positions.shape[1]
+
+
+def scatter(points: Points, subcells: int) -> Points:
+    """Move every point to the middle of a random one of subcells^D equal parts of its cell.
+
+    So the points of a coarse model start as a random choice of a finer solver's points, one in
+    each cell, which moves as the whole does. The choice is the same for the same number of points.
+    """
+    if subcells == 1:
+        return points
+    part = np.random.default_rng(0).integers(0, subcells, points.positions.shape)
+    offset = (part + 0.5) / subcells - 0.5
+    return replace(points, positions=points.positions + points.spacing * offset)
 
 
 def fill(scene: Scene, spacing: float) -> Points:

@@ -3,7 +3,9 @@
 The files come from the reference solver at a fine spacing; a learned model works at `ratio` times
 that spacing and `stride` times their frame interval. The points whose lattice coordinates agree
 modulo `ratio` form a lattice of the model's spacing, so every file holds ratio^D sets of tracers
-of one and the same flow: each of them is training data.
+of one and the same flow. They do not travel alike: sets that start half a spacing higher ran up to
+15% farther. A mixture of them, one random point of the solver in each cell of the model, moves as
+the whole does; that is what training draws.
 
 A window may begin at the first frame: history before t = 0 is the release velocity extended
 backwards, exactly as a rollout of the learned simulator begins.
@@ -53,11 +55,18 @@ class Source:
     frames: int  #: number of usable frames
     interval: float  #: between frames [s]
     residue: np.ndarray  #: tracer set of every point, shape (N,) uint8
+    cell: np.ndarray  #: cell of the model that every point starts in, shape (N,) int32
     counts: tuple[int, ...]  #: points of every release, in order
 
     def points(self, residue: int) -> int:
         """Number of points in a tracer set."""
         return int(np.count_nonzero(self.residue == residue))
+
+    def mixture(self, seed: int) -> np.ndarray:
+        """Indices of one random point in every cell; a cell cut off by a face may have none."""
+        sets = int(self.residue.max()) + 1
+        pick = np.random.default_rng(seed).integers(0, sets, int(self.cell.max()) + 1)
+        return np.flatnonzero(self.residue == pick[self.cell])
 
     def initial_velocity(self) -> np.ndarray:
         """Velocity of every point at t = 0 [m/s], shape (N, D)."""
@@ -138,7 +147,13 @@ class WindowIndex:
         return self.sources[source].frames - steps * self._stride(self.sources[source])
 
     def read(
-        self, source: int, frame: int, residue: int = 0, *, unroll: int | None = None
+        self,
+        source: int,
+        frame: int,
+        residue: int = 0,
+        *,
+        mixture: int | None = None,
+        unroll: int | None = None,
     ) -> Window:
         """Read one window; only the frames that it needs leave the disk.
 
@@ -146,6 +161,7 @@ class WindowIndex:
             source: which file, 0 to len(sources) - 1.
             frame: the current frame, 0 to `starts(source) - 1`.
             residue: which tracer set, 0 to `residues(source) - 1`.
+            mixture: seed of a mixture of the tracer sets, in place of one of them.
             unroll: number of future steps if it is not the index's.
 
         Raises:
@@ -156,7 +172,10 @@ class WindowIndex:
         if not 0 <= frame < self.starts(source, steps):
             raise IndexError(f"frame {frame} of {entry.path} has no {steps} frames after it")
         stride = self._stride(entry)
-        chosen = np.flatnonzero(entry.residue == residue)
+        if mixture is None:
+            chosen = np.flatnonzero(entry.residue == residue)
+        else:
+            chosen = entry.mixture(mixture)
         frames = frame + stride * np.arange(-self.history, steps + 1)
         out = np.empty((len(chosen), len(frames), self.dim), dtype=np.float32)
         try:
@@ -215,21 +234,25 @@ def read_source(path: Path, *, spacing: float) -> Source | None:
             f"which holds {len(points.positions)}"
         )
     ratio = _multiple(spacing, file_spacing, path, "spacing", "m")
-    residue = np.zeros(shape[1], dtype=np.int64)
-    for axis in range(scene.dim):
-        residue = residue * ratio + points.lattice[:, axis] % ratio
-    if ratio**scene.dim > 256:
-        raise FileFormatError(f"{path}: {ratio} times its spacing is too coarse a model")
     counts = tuple(
         len(fill(scene.model_copy(update={"releases": (release,)}), file_spacing).positions)
         for release in scene.releases
     )
+    residue = np.zeros(shape[1], dtype=np.int64)
+    release = np.repeat(np.arange(len(counts)), counts)
+    corner = np.column_stack([release, points.lattice // ratio])
+    cell = np.unique(corner, axis=0, return_inverse=True)[1].ravel()
+    for axis in range(scene.dim):
+        residue = residue * ratio + points.lattice[:, axis] % ratio
+    if ratio**scene.dim > 256:
+        raise FileFormatError(f"{path}: {ratio} times its spacing is too coarse a model")
     return Source(
         path=path,
         scene=scene,
         frames=shape[0],
         interval=float(intervals.mean()),
         residue=residue.astype(np.uint8),
+        cell=cell.astype(np.int32),
         counts=counts,
     )
 

@@ -96,6 +96,8 @@ class ModelConfig(BaseModel):
 
     dim: Literal[2, 3] = 3
     spacing: Positive = 0.03125  #: of the points that it moves [m]
+    #: A point starts in the middle of a random one of subcells^D equal parts of its cell.
+    subcells: Annotated[int, Field(ge=1)] = 1
     dt: Positive = 0.0125  #: stride of one step [s]
     radius: Positive = 0.05  #: points closer than this are joined by an edge [m]
     history: Annotated[int, Field(ge=1)] = 3  #: number of past velocities that it sees

@@ -16,7 +16,7 @@ from torch import Tensor
 from gns_model.errors import SimulatorError
 from gns_model.learned.model import LearnedModel
 from gns_model.learned.rollout import frame_count, roll_out, roll_out_tensor
-from gns_model.particles import MOVING, Points, fill
+from gns_model.particles import MOVING, Points, fill, scatter
 from gns_model.scene import Scene
 from gns_model.simulator import Progress
 from gns_model.trajectory import DIVERGED, OK, Trajectory
@@ -94,6 +94,9 @@ class LearnedSimulator:
                     stacklevel=2,
                 )
 
+    def _fill(self, scene: Scene) -> Points:
+        return scatter(fill(scene, self.config.spacing), self.config.subcells)
+
     # -- rollouts ------------------------------------------------------------------------------
 
     def rollout(
@@ -115,7 +118,7 @@ class LearnedSimulator:
             self.check(scene)
         if self.workers > 1 and len(scenes) > 1 and self.device.type == "cpu":
             return self._share(scenes, progress)
-        points = [fill(scene, self.config.spacing) for scene in scenes]
+        points = [self._fill(scene) for scene in scenes]
         work = [
             len(p.positions) * frame_count(self.config, scene)
             for scene, p in zip(scenes, points, strict=True)
@@ -233,7 +236,7 @@ class LearnedSimulator:
         scenes = list(scenes)
         for scene in scenes:
             self.check(scene)
-        points = [fill(scene, self.config.spacing) for scene in scenes]
+        points = [self._fill(scene) for scene in scenes]
         with self._settings():
             return roll_out_tensor(
                 self.model,

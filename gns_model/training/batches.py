@@ -29,7 +29,7 @@ class Draw:
 
     source: int
     frame: int
-    residue: int
+    mixture: int  #: seed of the choice of tracers
     mirror: bool
     edges: float  #: that it will have, about
 
@@ -71,7 +71,7 @@ def draw(
 ) -> list[list[Draw]]:
     """The windows of one step for every rank, so that all have about `edges_per_batch` edges.
 
-    Trajectories, frames and tracer sets are drawn uniformly, but for a share `early` of the windows
+    Trajectories, frames and tracers are drawn uniformly, but for a share `early` of the windows
     that come from the first EARLY_STEPS steps of a rollout: a release collapses within a few steps,
     every later step inherits what goes wrong there, and uniform draws hardly ever show it.
 
@@ -88,13 +88,13 @@ def draw(
             frame = stride * int(rng.integers(min(EARLY_STEPS, -(-starts // stride))))
         else:
             frame = int(rng.integers(starts))
-        residue = int(rng.integers(index.residues(source)))
+        mixture = int(rng.integers(2**31))
         flip = bool(rng.integers(2)) and mirror
-        points = index.sources[source].points(residue)
+        points = len(index.sources[source].residue) // index.residues(source)
         edges = statistics.edges(points, (frame + 0.5) / starts)
         if len(draws) >= ranks and total + edges / 2 > ranks * edges_per_batch:
             break
-        draws.append(Draw(source, frame, residue, flip, edges))
+        draws.append(Draw(source, frame, mixture, flip, edges))
         total += edges
     parts: list[list[Draw]] = [[] for _ in range(ranks)]
     for item in sorted(draws, key=lambda d: -d.edges):
@@ -104,7 +104,7 @@ def draw(
 
 def read(index: WindowIndex, item: Draw, *, unroll: int = 1) -> Window:
     """Read what was drawn, mirrored if so drawn."""
-    window = index.read(item.source, item.frame, item.residue, unroll=unroll)
+    window = index.read(item.source, item.frame, mixture=item.mixture, unroll=unroll)
     if not item.mirror:
         return window
     return Window(

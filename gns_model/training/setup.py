@@ -33,13 +33,17 @@ def open_data(recipe: Recipe, folders: tuple[str, ...]) -> WindowIndex:
     return index
 
 
+#: What of a model's configuration the weights do not depend on: it may change on the way.
+FREE = {"noise_std", "subcells"}
+
+
 def check_resumable(recipe: Recipe, position: Position) -> None:
-    """Refuse to go on with another model or seed; budget, rate and data may change.
+    """Refuse to go on with another network or seed; budget, rate, data and noise may change.
 
     Raises:
         RecipeError: naming the first key that differs.
     """
-    wanted = {**recipe.model.model_dump(mode="json"), "seed": recipe.seed}
+    wanted = {**recipe.model.model_dump(mode="json", exclude=FREE), "seed": recipe.seed}
     found = {**position.architecture, "seed": position.seed}
     for key in wanted:
         if wanted[key] != found.get(key):

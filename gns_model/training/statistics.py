@@ -84,8 +84,8 @@ def measure(
         # Strata of time, so that a few windows already see all of a flow.
         when = (k % TIME_BINS + rng.random()) / TIME_BINS
         frame = min(starts - 1, int(when * starts))
-        residue = int(rng.integers(index.residues(source)))
-        window = index.read(source, frame, residue, unroll=1)
+        mixture = int(rng.integers(2**31))
+        window = index.read(source, frame, mixture=mixture, unroll=1)
         now, before = window.history[:, -1].astype(float), window.history[:, -2].astype(float)
         velocity = (now - before) / index.dt
         acceleration = ((window.future[:, 0] - now) / index.dt - velocity) / index.dt

@@ -169,6 +169,18 @@ def test_the_hybrid_search_on_a_learned_simulator(scene, checkpoint, tmp_path):
     assert Trajectory.load(tmp_path / "trajectories" / "best-learned.h5").simulator == "tiny"
 
 
+def test_a_device_runs_batches_in_this_process(scene, checkpoint, tmp_path):
+    # "cpu:0" takes the way of a GPU: one process, whole batches.
+    spec = SimulatorSpec(str(checkpoint), device="cpu:0")
+    settings = Settings(budget=10, verify=0, simulator=spec, workers=1)
+    summary = optimise(scene, tmp_path, settings)
+    assert summary["rollouts"] + summary["backwards"] in (9, 10)
+    alone = SimulatorSpec(str(checkpoint))
+    again = measure(Scene.from_toml(tmp_path / "layouts" / "best.toml"), alone)
+    expected = summary["best"]["surrogate"]["centroid_travel"]
+    assert again["measures"]["centroid_travel"] == pytest.approx(expected, rel=1e-3)
+
+
 def test_an_interrupt_leaves_a_summary_and_the_next_run_goes_on(scene, tmp_path, monkeypatch):
     evaluate = run_module.InWorkers.evaluate
     calls = []

@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gns_model.errors import SceneError
-from gns_model.particles import fill
+from gns_model.paper import flume_scene
+from gns_model.particles import fill, scatter
 from gns_model.scene import Scene
 
 
@@ -89,3 +90,16 @@ def test_every_second_point_is_a_lattice_of_twice_the_spacing(flume: Scene):
 def test_a_release_thinner_than_the_spacing_is_refused():
     with pytest.raises(SceneError, match=r"release\[0\].*0\.05.*thinner than the spacing 0.1"):
         fill(block([1.0, 0.05]), 0.1)
+
+
+@pytest.mark.parametrize("subcells", [1, 2, 3])
+def test_scattered_points_stay_in_their_cells_and_keep_their_mean(subcells):
+    scene = flume_scene()
+    regular = fill(scene, 0.03125)
+    moved = scatter(regular, subcells)
+    offset = (moved.positions - regular.positions) / regular.spacing
+    places = (np.arange(subcells) + 0.5) / subcells - 0.5
+    assert np.isin(offset.round(9), places.round(9)).all()
+    assert len(np.unique(offset.round(9))) == subcells
+    np.testing.assert_allclose(offset.mean(axis=0), 0, atol=0.02)
+    np.testing.assert_array_equal(moved.positions, scatter(regular, subcells).positions)

@@ -72,6 +72,23 @@ def test_tracer_sets_share_out_all_points_and_are_lattices(folder):
         assert gaps[gaps > 0].min() == pytest.approx(COARSE, rel=1e-4)
 
 
+def test_a_mixture_holds_one_random_point_of_every_cell(folder):
+    data = index(folder)
+    ratio = round(COARSE / FINE)
+    points = fill(data.sources[0].scene, FINE)
+    chosen = data.sources[0].mixture(3)
+    # The counts of both releases divide by the ratio, so that every cell is whole.
+    assert len(chosen) * ratio**3 == len(points.positions)
+    release = np.searchsorted(np.cumsum(data.sources[0].counts), chosen, side="right")
+    cells = np.column_stack([release, points.lattice[chosen] // ratio])
+    assert len(np.unique(cells, axis=0)) == len(chosen)
+    assert len(np.unique(data.sources[0].residue[chosen])) == ratio**3
+    assert not np.array_equal(chosen, data.sources[0].mixture(4))
+    window = data.read(0, 2, mixture=3)
+    truth = Trajectory.load(folder / "a.h5").positions
+    np.testing.assert_array_equal(window.history[:, -1], truth[2][chosen])
+
+
 @settings(max_examples=40, deadline=None)
 @given(data=st.data())
 def test_a_window_is_what_the_file_holds(folder, data):
