@@ -1,7 +1,9 @@
 """Bayesian search: an Optuna sampler proposes batches of layouts, each batch is one evaluation.
 
-The sampler sees layouts through `parameters` (one point a layout) and learns from the buildable
-layout that was run, not from the wish that was projected onto it.
+The sampler sees layouts through `parameters`, one point a layout. A point whose layout cannot be
+built stands for the buildable layout nearest to it, so the cost is a function on the whole cube and
+the sampler is told what its own proposal gave. (Told the parameters of the projected layout
+instead, it never learns what its proposal was worth, and makes it again and again.)
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from optuna.trial import FrozenTrial
 
 from design.baselines import engineering_layouts
 from design.campaign import Campaign
-from design.parameters import to_centres, to_parameters
+from design.parameters import to_parameters
 from design.trials import TrialLog
 
 #: Trials, baselines included, before the model takes over.
@@ -60,9 +62,7 @@ def sampler(campaign: Campaign) -> optuna.samplers.BaseSampler:
 
 
 class BuildableSampler(optuna.samplers.BaseSampler):
-    """Passes on what `model` proposes as the nearest buildable layout, so that the parameters in
-    the study are those of the layout that was run. Before the model has seen enough it proposes
-    random buildable layouts."""
+    """Proposes what `model` does, and random buildable layouts before the model has seen enough."""
 
     def __init__(
         self, model: optuna.samplers.BaseSampler, log: TrialLog, rng: np.random.Generator
@@ -81,11 +81,10 @@ class BuildableSampler(optuna.samplers.BaseSampler):
     def sample_relative(
         self, study: optuna.Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
     ) -> dict[str, Any]:
-        """Parameters of the buildable layout nearest to the model's proposal."""
-        space = self._log.space
+        """Parameters of the next proposal."""
         wish = self._model.sample_relative(study, trial, search_space)
-        centres = to_centres(space, wish) if wish else space.random(self._rng)
-        return dict(to_parameters(space, self._log.buildable(centres)))
+        space = self._log.space
+        return wish or dict(to_parameters(space, space.random(self._rng)))
 
     def sample_independent(
         self,

@@ -14,6 +14,7 @@ from gns_model import console
 
 if TYPE_CHECKING:
     from design.evaluators import SimulatorSpec
+    from gns_env.objective import Objective
 
 app = typer.Typer(
     help="Find where baffles stop a granular flow, checked by the reference solver.",
@@ -29,6 +30,13 @@ Simulator = Annotated[
 Spacing = Annotated[
     Optional[float],  # noqa: UP045  (typer reads it at run time, also on Python 3.11)
     typer.Option(help="Spacing of points for mpm [m]; default: the solver's fine one."),
+]
+Weight = Annotated[
+    Optional[float],  # noqa: UP045
+    typer.Option(
+        help="Weight of this measure, relative to no baffles; default: the objective's.",
+        show_default=False,
+    ),
 ]
 Device = Annotated[str, typer.Option(help="torch device of a learned simulator: cpu or cuda.")]
 
@@ -49,7 +57,7 @@ def optimize(
     budget: Annotated[
         int,
         typer.Option(help="Rollouts of the search; a gradient's backward pass counts as one too."),
-    ] = 64,
+    ] = 48,
     verify: Annotated[
         int, typer.Option(help="How many of the best the reference solver judges; 0: none.")
     ] = 4,
@@ -74,11 +82,9 @@ def optimize(
     device: Device = "cpu",
     verify_with: Annotated[str, typer.Option(help="Who judges the best layouts.")] = "mpm",
     verify_spacing: Spacing = None,
-    runout_weight: Annotated[float, typer.Option(help="Weight of the centroid's travel.")] = 1.0,
-    depth_weight: Annotated[float, typer.Option(help="Weight of the upstream depth.")] = 0.25,
-    mass_weight: Annotated[
-        float, typer.Option(help="Weight of the mass past the control section.")
-    ] = 0.0,
+    runout_weight: Weight = None,
+    depth_weight: Weight = None,
+    mass_weight: Weight = None,
     batch: Annotated[int, typer.Option(help="Layouts proposed at a time.")] = 8,
     workers: Annotated[
         Optional[int],  # noqa: UP045
@@ -92,7 +98,6 @@ def optimize(
 
         given = Scene.from_toml(scene)
         from design.run import Settings, optimise
-        from gns_env.objective import Objective
 
         settings = Settings(
             method=method,
@@ -102,7 +107,7 @@ def optimize(
             seed=seed,
             simulator=_spec(simulator, spacing, device),
             verifier=_spec(verify_with, verify_spacing, device),
-            objective=Objective(
+            objective=_objective(
                 runout_weight=runout_weight, depth_weight=depth_weight, mass_weight=mass_weight
             ),
             storage=storage,
@@ -158,6 +163,13 @@ def _spec(name: str, spacing: float | None, device: str) -> SimulatorSpec:
     if kind not in ("cpu", "cuda") or (kind == "cuda" and not torch.cuda.is_available()):
         raise SimulatorError(f"device {device!r} is not there: give cpu, or cuda on a GPU machine")
     return SimulatorSpec(name, device=device)
+
+
+def _objective(**weights: float | None) -> Objective:
+    from gns_env.objective import Objective
+
+    given: dict[str, Any] = {name: value for name, value in weights.items() if value is not None}
+    return Objective(**given)
 
 
 def _show(summary: dict[str, Any], folder: Path) -> None:

@@ -44,7 +44,7 @@ class Settings:
 
     method: str | None = None
     baffles: int | None = None
-    budget: int = 64
+    budget: int = 48
     verify: int = 4
     seed: int = 0
     simulator: SimulatorSpec = field(default_factory=lambda: SimulatorSpec("baffle-lite"))

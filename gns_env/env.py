@@ -83,9 +83,9 @@ class GranularBaffleEnv(gymnasium.Env[dict[str, NDArray[np.float32]], NDArray[np
 
     The decrease of the objective's cost that the new baffle brings, so that the rewards of an
     episode sum to the cost of no baffles less that of the layout. The default cost is
-    `centroid_travel / (that without baffles) + 0.25 * upstream_depth / (that without baffles)`, the
+    `centroid_travel / (that without baffles) + 0.5 * upstream_depth / (that without baffles)`, the
     depth counting as no less than that of the free flow (see `gns_env.Objective`): it is
-    1.25 without baffles. A rollout that fails (diverges, or leaks grains into baffles) costs 10
+    1.5 without baffles. A rollout that fails (diverges, or leaks grains into baffles) costs 10
     times as much as no baffles.
 
     ## Starting State

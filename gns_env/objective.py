@@ -51,7 +51,7 @@ class Objective:
     """
 
     runout_weight: float = 1.0
-    depth_weight: float = 0.25
+    depth_weight: float = 0.5
     mass_weight: float = 0.0
     runout: Literal["centroid_travel", "runout_p99"] = "centroid_travel"
 

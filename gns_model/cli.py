@@ -185,6 +185,7 @@ def evaluate(
     gradients: Annotated[
         int, typer.Option(min=0, help="Scenes to check design gradients on, at full length.")
     ] = 0,
+    workers: Workers = CORES,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -193,7 +194,7 @@ def evaluate(
     from gns_model.simulator import load_simulator
     from gns_model.trajectory import Trajectory
 
-    simulator = load_simulator(model)
+    simulator = load_simulator(model, workers=workers)
     files = sorted(data.glob("*.h5"))[:count]
     if not files:
         raise GnsError(f"{data}: no trajectory files (*.h5)")
@@ -201,7 +202,10 @@ def evaluate(
     with console.progress_bar(quiet=quiet) as bar:
         task = bar.add_task(f"{model} on {len(files)} scenes", total=1.0)
         comparison = compare(
-            simulator, references, progress=lambda f: bar.update(task, completed=f)
+            simulator,
+            references,
+            batch=2 * workers,
+            progress=lambda f: bar.update(task, completed=f),
         )
     result = comparison.to_dict()
     if gradients:

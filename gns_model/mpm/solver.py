@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import multiprocessing
 import os
+import threading
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -32,6 +33,13 @@ DEFAULT_SPACING = {2: 0.0125, 3: 0.015625}
 DAMPING_RATE = 50.0
 #: A point this many times faster than gravity can make it has left physics: the rollout diverged.
 ABSURD = 10.0
+
+# numba's OpenMP layer sets the number of threads of the whole process, torch's included, whose
+# one-thread rollouts then fight for all cores, many times slower. Its own layer leaves torch
+# alone; it takes one caller at a time, which the lock sees to.
+if "NUMBA_THREADING_LAYER" not in os.environ:
+    numba.config.THREADING_LAYER = "workqueue"
+_ONE_CALLER = threading.Lock()
 
 
 class MpmSimulator:
@@ -164,11 +172,15 @@ class MpmSimulator:
         positions[0] = start.positions
         status = OK
         spare, spare_ids = np.empty_like(points), np.empty_like(ids)
+        threads = min(self.threads, numba.config.NUMBA_NUM_THREADS)
         threads_before = numba.get_num_threads()
-        numba.set_num_threads(min(self.threads, numba.config.NUMBA_NUM_THREADS))
         try:
             for frame in range(1, frames + 1):
-                points, ids, spare, spare_ids = advance(points, ids, spare, spare_ids, *arguments)
+                with _ONE_CALLER:
+                    numba.set_num_threads(threads)
+                    points, ids, spare, spare_ids = advance(
+                        points, ids, spare, spare_ids, *arguments
+                    )
                 if not np.abs(points[:, 3:6]).max() < limit:  # False for NaN, too
                     status = DIVERGED
                     positions[frame:] = positions[frame - 1]

@@ -42,6 +42,7 @@ def refused(capsys, *arguments: object) -> str:
     return captured.err
 
 
+@pytest.mark.slow
 def test_optimize_and_evaluate_end_to_end(scene_file, tmp_path, small_flume):
     out = tmp_path / "run"
     options = ["--budget", "8", "--verify", "1", "--workers", "2", "--out", str(out)]
@@ -145,6 +146,7 @@ def test_an_out_that_cannot_be_written(capsys, scene_file, tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_what_there_is(scene_file, tmp_path):
     out = tmp_path / "run"
     process = subprocess.Popen(

@@ -32,13 +32,13 @@ CROWDED = {
 def test_every_layout_that_is_run_is_buildable(tmp_path, method):
     simulator = FormulaSimulator()
     scene = formula_scene(**CROWDED)
-    c = campaign(tmp_path, simulator=simulator, scene=scene, n=3, budget=36)
+    c = campaign(tmp_path, simulator=simulator, scene=scene, n=3, budget=26)
     METHODS[method](c)
     ran = [s for s in simulator.seen if s.baffles]
     assert ran or method == "gradient"
     layouts = [np.array([b.center for b in s.baffles]) for s in ran]
     layouts += [t.centres for t in c.log.trials()]
-    assert len(layouts) >= 18
+    assert len(layouts) >= 13
     for layout in layouts:
         assert layout.shape == (3, 2)
         assert c.space.check(layout) == []
@@ -60,12 +60,12 @@ def test_the_budget_is_spent_and_counted(tmp_path, method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_search_beats_chance(tmp_path, method):
-    c = campaign(tmp_path, n=2, budget=50, seed=3)
+    c = campaign(tmp_path, n=2, budget=40, seed=3)
     METHODS[method](c)
     task = c.evaluator.task
     rng = np.random.default_rng(0)
     by_chance = [
-        min(e.cost for e in task.evaluate([x for _, x in random_layouts(c.space, 50, rng)]))
+        min(e.cost for e in task.evaluate([x for _, x in random_layouts(c.space, 40, rng)]))
         for _ in range(5)
     ]
     assert c.log.best().cost < np.median(by_chance)
@@ -92,14 +92,14 @@ def test_a_resumed_search_is_the_search_that_was_not_interrupted(tmp_path):
     whole, halves = tmp_path / "whole", tmp_path / "halves"
     whole.mkdir()
     halves.mkdir()
-    c = campaign(whole, budget=32, seed=5)
+    c = campaign(whole, budget=24, seed=5)
     bayes.search(c)
     bayes.search(campaign(halves, budget=16, seed=5))
-    resumed = campaign(halves, budget=32, seed=5, resume=True)
+    resumed = campaign(halves, budget=24, seed=5, resume=True)
     assert len(resumed.log.trials()) == 16
     bayes.search(resumed)
     costs = [[t.cost for t in s.log.trials()] for s in (c, resumed)]
-    assert len(costs[0]) == 32
+    assert len(costs[0]) == 24
     assert costs[0] == costs[1]
 
 

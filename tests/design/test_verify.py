@@ -17,7 +17,8 @@ def trial(number, centres, cost, status="ok"):
 def judged(cost, travel, *, origin="bayes", status="ok", shift=0.0):
     """A layout that the search thinks costs `cost` and whose verified travel is `travel`."""
     j = Judged(origin, LAYOUT + shift, {"centroid_travel": 0.6, "upstream_depth": 0.2}, cost)
-    j.judge(status, {"centroid_travel": travel, "upstream_depth": 0.2}, NONE, Objective())
+    verified = {"centroid_travel": travel, "upstream_depth": 0.2}
+    j.judge(status, verified, NONE, Objective(depth_weight=0.25))
     return j
 
 

@@ -46,6 +46,12 @@ def simulator(request: pytest.FixtureRequest, coarse_mpm: MpmSimulator) -> Simul
     return gns_model.load_simulator(request.param)
 
 
+@pytest.fixture
+def site(flume: Scene, simulator: Simulator) -> Scene:
+    """The flume; for the shipped model, which takes ten seconds for all of it, its first third."""
+    return flume if simulator.name == "mpm" else flume.replace(duration=0.3)
+
+
 class Faulty:
     """The coarse solver, made to fail as a network may: for scenes with `at_least` baffles."""
 

@@ -25,23 +25,23 @@ MEASURES = {
 }
 
 
-def test_the_default_is_centroid_travel_and_a_quarter_of_depth_relative_to_no_baffles() -> None:
+def test_the_default_is_centroid_travel_and_half_of_depth_relative_to_no_baffles() -> None:
     objective = Objective()
-    assert objective.cost(MEASURES, REFERENCE) == pytest.approx(0.57 / 0.6 + 0.25 * 0.2 / 0.1)
-    assert objective.cost(REFERENCE, REFERENCE) == pytest.approx(objective.baseline) == 1.25
+    assert objective.cost(MEASURES, REFERENCE) == pytest.approx(0.57 / 0.6 + 0.5 * 0.2 / 0.1)
+    assert objective.cost(REFERENCE, REFERENCE) == pytest.approx(objective.baseline) == 1.5
     assert str(objective) == (
-        "centroid travel + 0.25 x upstream depth (at least the free flow's), each relative to no "
-        "baffles (no baffles: 1.25; lower is better)"
+        "centroid travel + 0.5 x upstream depth (at least the free flow's), each relative to no "
+        "baffles (no baffles: 1.5; lower is better)"
     )
 
 
 def test_baffles_that_the_flow_never_reaches_earn_nothing() -> None:
     unreached = {**REFERENCE, "upstream_depth": 0.0}
-    assert Objective().cost(unreached, REFERENCE) == pytest.approx(1.25)
+    assert Objective().cost(unreached, REFERENCE) == pytest.approx(1.5)
     depth = torch.tensor(0.01, dtype=torch.float64, requires_grad=True)
     travel = torch.tensor(0.6, dtype=torch.float64, requires_grad=True)
     value = Objective().smooth({"centroid_travel": travel, "upstream_depth": depth}, REFERENCE)
-    assert value.item() == pytest.approx(1.25)
+    assert value.item() == pytest.approx(1.5)
     value.backward()
     assert (travel.grad, depth.grad) == (pytest.approx(1 / 0.6), 0.0)
 

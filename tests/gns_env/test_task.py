@@ -19,9 +19,9 @@ ONE = [[0.55, 0.3]]
 TWO = [[0.45, 0.2], [0.6, 0.4]]
 
 
-def test_evaluations_are_the_simulators_measures(flume: Scene, simulator: Simulator) -> None:
-    task = BaffleTask(flume, simulator)
-    paper = [b.center for b in flume.baffles]
+def test_evaluations_are_the_simulators_measures(site: Scene, simulator: Simulator) -> None:
+    task = BaffleTask(site, simulator)
+    paper = [b.center for b in site.baffles]
     evaluation = task.evaluate([paper], trajectories=True)[0]
     trajectory = simulator.rollout([task.scene.with_baffles(paper)])[0]
     expected, reference = summary(trajectory), summary(simulator.rollout([task.scene])[0])

@@ -367,6 +367,6 @@ def test_the_gradient_of_an_untrained_net_is_checked_too(small_flume: Scene):
 def test_a_shipped_model_knows_which_way_to_move_a_baffle(name: str, flume: Scene):
     """Over the whole flow; the paper's way of baffles had a cosine of -0.6 here."""
     simulator = load_simulator(name)
-    layouts = ([[0.775, 0.5], [0.80, 1.4], [1.2, 0.95]], [[0.9, 0.8], [0.85, 1.3], [1.25, 0.5]])
-    cosines = [gradient_check(simulator, flume.with_baffles(c)).cosine for c in layouts]
-    assert min(cosines) >= 0.9, cosines
+    layout = flume.with_baffles([[0.775, 0.5], [0.80, 1.4], [1.2, 0.95]])
+    check = gradient_check(simulator, layout)
+    assert check.cosine >= 0.9, (check.autograd, check.differences)

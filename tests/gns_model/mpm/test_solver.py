@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 
+import numba
 import numpy as np
 import pytest
 
@@ -209,6 +210,12 @@ def test_workers_return_what_one_process_returns():
     for a, b in zip(alone, side_by_side, strict=True):
         assert a.scene == b.scene
         np.testing.assert_array_equal(a.positions, b.positions)
+
+
+def test_the_solver_leaves_torchs_threads_alone():
+    """With numba's OpenMP layer a learned rollout after this one would be many times slower."""
+    MpmSimulator(spacing=0.1).rollout([scene(duration=0.05)])
+    assert numba.threading_layer() == "workqueue"
 
 
 def test_progress_reaches_one_and_an_interrupt_passes_through():
