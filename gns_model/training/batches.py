@@ -34,10 +34,6 @@ class Draw:
     edges: float  #: that it will have, about
 
 
-#: Steps of a rollout in which a release turns into a flow: 0.16 s of the flume at 0.02 s.
-EARLY_STEPS = 8
-
-
 @dataclass(frozen=True)
 class Batch:
     """Windows side by side.
@@ -67,12 +63,13 @@ def draw(
     statistics: Statistics,
     mirror: bool,
     early: float = 0.0,
+    early_steps: int = 8,
     unroll: int = 1,
 ) -> list[list[Draw]]:
     """The windows of one step for every rank, so that all have about `edges_per_batch` edges.
 
     Trajectories, frames and tracers are drawn uniformly, but for a share `early` of the windows
-    that come from the first EARLY_STEPS steps of a rollout: a release collapses within a few steps,
+    that come from the first `early_steps` steps of a rollout: a release collapses within a few steps,
     every later step inherits what goes wrong there, and uniform draws hardly ever show it.
 
     Every rank calls this with the same generator and takes its own part. The largest windows are
@@ -85,7 +82,7 @@ def draw(
         starts = index.starts(source, unroll)
         stride = index.stride(source)
         if rng.random() < early:
-            frame = stride * int(rng.integers(min(EARLY_STEPS, -(-starts // stride))))
+            frame = stride * int(rng.integers(min(early_steps, -(-starts // stride))))
         else:
             frame = int(rng.integers(starts))
         mixture = int(rng.integers(2**31))

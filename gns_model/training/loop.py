@@ -166,6 +166,7 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: threadin
                 statistics=position.statistics,
                 mirror=recipe.mirror,
                 early=recipe.early,
+                early_steps=recipe.early_steps,
                 unroll=steps,
             )[ranks.rank]
             batch = batches.collate(

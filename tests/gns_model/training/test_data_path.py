@@ -12,7 +12,7 @@ from gns_model.learned.graph import radius_graph
 from gns_model.learned.model import LearnedModel
 from gns_model.scene import Scene
 from gns_model.training.augment import mirror_positions, mirrored
-from gns_model.training.batches import DRAW, EARLY_STEPS, collate, draw, generator, read
+from gns_model.training.batches import DRAW, collate, draw, generator, read
 from gns_model.training.loss import step_error, unrolled_loss
 from gns_model.training.statistics import measure
 
@@ -285,9 +285,10 @@ def test_early_windows_are_drawn_as_often_as_asked(slides):
                 statistics=measured,
                 mirror=False,
                 early=early,
+                early_steps=8,
             )[0]
         ]
-        early_frames = EARLY_STEPS * windows.stride(0)
+        early_frames = 8 * windows.stride(0)
         assert all(0 <= item.frame < windows.starts(item.source, 1) for item in draws)
         return np.mean([item.frame < early_frames for item in draws])
 
