@@ -12,15 +12,16 @@ from design.campaign import Campaign
 from design.distinct import apart
 from design.gradient import STEP, descend, require_gradient
 
-#: Share of the budget that is sampled before the first leap, and the share of each leap.
-EXPLORE, LEAP = 0.5, 0.375
+#: Share of the budget that is sampled before the first leap, and the share of each leap. A gradient
+#: takes about four rollouts of time and counts two, so leaps are the smaller part.
+EXPLORE, LEAP = 0.6, 0.25
 #: Most chains of one leap, and the fewest gradients of a chain: long chains from few starts beat
 #: single steps from many.
 CHAINS, LEAST_GRADIENTS = 4, 3
 
 
 def search(campaign: Campaign) -> None:
-    """Half of the budget on sampling, then leaps and batches by turns.
+    """Most of the budget on sampling, then leaps and batches by turns.
 
     Raises:
         SimulatorError: if the simulator has no gradient.

@@ -69,8 +69,8 @@ def draw(
     """The windows of one step for every rank, so that all have about `edges_per_batch` edges.
 
     Trajectories, frames and tracers are drawn uniformly, but for a share `early` of the windows
-    that come from the first `early_steps` steps of a rollout: a release collapses within a few steps,
-    every later step inherits what goes wrong there, and uniform draws hardly ever show it.
+    that come from the first `early_steps` steps of a rollout: a release collapses within a few
+    steps, every later step inherits what goes wrong there, and uniform draws hardly ever show it.
 
     Every rank calls this with the same generator and takes its own part. The largest windows are
     dealt first, each to the rank that has the least, so that no rank waits long for another.
