@@ -36,7 +36,7 @@ def search(campaign: Campaign) -> None:
 def leap(campaign: Campaign) -> None:
     """Gradient steps from the best layouts that no gradient has been taken at or near."""
     budget = min(round(LEAP * campaign.budget), campaign.left())
-    count = min(CHAINS, budget // (2 * LEAST_GRADIENTS))
+    count = min(CHAINS, max(budget // (2 * LEAST_GRADIENTS), 1))
     trials = sorted((t for t in campaign.log.trials() if t.ok), key=lambda t: t.cost)
     leapt = [t.centres for t in trials if t.origin == "gradient"]
     descend(campaign, apart([t.centres for t in trials], STEP, count, avoid=leapt), budget)
