@@ -15,7 +15,7 @@ export OMP_NUM_THREADS ?= 1
 	touch $@
 
 demo: .venv/.done
-	.venv/bin/gns-design optimize examples/flume.toml --budget 32 --verify 3 --out $(RUN)
+	.venv/bin/gns-design optimize examples/flume.toml --budget 24 --verify 3 --out $(RUN)
 
 test: .venv/.done
 	.venv/bin/pytest --durations=15

@@ -22,6 +22,7 @@ from gns_env.layout import LayoutSpace
 from gns_env.task import BaffleTask
 from gns_model import measures as hard
 from gns_model.errors import SimulatorError
+from gns_model.learned.rollout import ADJOINT_LIMIT
 from gns_model.particles import MOVING
 from gns_model.scene import Scene
 from gns_model.trajectory import DIVERGED, OK, Trajectory
@@ -169,7 +170,7 @@ def differentiate(task: BaffleTask, layouts: Sequence[np.ndarray]) -> list[Outco
     simulator = task.simulator
     scenes = [task.scene_with(layout) for layout in layouts]
     centres = [torch.tensor(np.asarray(c, dtype=np.float64), requires_grad=True) for c in layouts]
-    rollouts = simulator.rollout_tensor(scenes, centres)  # type: ignore[attr-defined]
+    rollouts = simulator.rollout_tensor(scenes, centres, limit=ADJOINT_LIMIT)  # type: ignore[attr-defined]
     reference = task.reference
     smooth = [
         task.objective.smooth(

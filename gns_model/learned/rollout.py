@@ -80,6 +80,37 @@ def roll_out(
     return out, diverged
 
 
+#: Limit of a grain's adjoint for design gradients over a whole flow, in medians of its scene.
+#: On the flume with `baffle-lite` the cosine with central differences rose from 0.26 to 0.87.
+ADJOINT_LIMIT = 1.5
+
+
+class LimitAdjoint(torch.autograd.Function):
+    """The identity; backward, no row may exceed `limit` times the median norm of its scene's rows.
+
+    A granular flow is chaotic: over tens of steps the adjoints of a few grains grow without bound
+    and drown what all others agree on, which is what a finite move of a baffle does.
+    """
+
+    @staticmethod
+    def forward(ctx, positions: Tensor, counts: list[int], limit: float) -> Tensor:
+        """Positions (N, D) of scenes with `counts` points each."""
+        ctx.counts, ctx.limit = counts, limit
+        return positions.view_as(positions)
+
+    @staticmethod
+    def backward(ctx, adjoint: Tensor) -> tuple[Tensor, None, None]:
+        """Adjoint (N, D), row by row no longer than allowed."""
+        limited = []
+        for part in adjoint.split(ctx.counts):
+            norm = part.norm(dim=1, keepdim=True)
+            felt = norm[norm > 0]
+            if len(felt):
+                part = part * (ctx.limit * felt.median() / norm.clamp_min(1e-30)).clamp(max=1)
+            limited.append(part)
+        return torch.cat(limited), None, None
+
+
 def roll_out_tensor(
     model: LearnedModel,
     scenes: Sequence[Scene],
@@ -89,6 +120,7 @@ def roll_out_tensor(
     frames: int | None,
     checkpoint: bool,
     noise: Sequence[Tensor] | None,
+    limit: float | None,
 ) -> list[Tensor]:
     """As `LearnedSimulator.rollout_tensor`, which see."""
     config, place = model.config, _place(model)
@@ -111,6 +143,8 @@ def roll_out_tensor(
             track.append(rematerialise(step, *past, use_reentrant=False))
         else:
             track.append(step(*past))
+        if limit is not None:
+            track[-1] = LimitAdjoint.apply(track[-1], [len(h) for h in histories], limit)
     whole = torch.stack(track[depth - 1 :])
     parts = whole.split([len(h) for h in histories], dim=1)
     return [p[:t, :n] for p, t, n in zip(parts, lengths, moving, strict=True)]

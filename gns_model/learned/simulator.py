@@ -213,6 +213,7 @@ class LearnedSimulator:
         frames: int | None = None,
         checkpoint: bool = True,
         noise: Sequence[Tensor] | None = None,
+        limit: float | None = None,
     ) -> list[Tensor]:
         """A rollout that autograd can differentiate with respect to the baffles.
 
@@ -226,6 +227,8 @@ class LearnedSimulator:
             checkpoint: recompute every step in the backward pass, so that memory holds positions
                 and the inside of one step only.
             noise: displacement of the starting points [m], a tensor (N, D) for each scene.
+            limit: of a grain's adjoint in every step, see `rollout.LimitAdjoint`; default: none,
+                the exact gradient, which over a whole flow says little about a finite move.
 
         Returns:
             positions [m], (T, N, D) for each scene, in the dtype of the model.
@@ -246,6 +249,7 @@ class LearnedSimulator:
                 frames=frames,
                 checkpoint=checkpoint,
                 noise=noise,
+                limit=limit,
             )
 
 

@@ -10,6 +10,7 @@ import torch
 from gns_model.errors import SimulatorError
 from gns_model.learned import LearnedSimulator, Limits
 from gns_model.learned import simulator as module
+from gns_model.learned.rollout import LimitAdjoint
 from gns_model.simulator import Simulator
 from gns_model.trajectory import Trajectory
 
@@ -266,3 +267,16 @@ def test_bfloat16_rollout_stays_near(make_model, make_scene):
         for p in ("float32", "bfloat16")
     )
     assert 0 < np.abs(exact - short).max() < 2e-3
+
+
+def test_no_grain_drowns_the_others_in_a_limited_gradient():
+    adjoint = torch.tensor(
+        [[1.0, 0.0], [0.0, 1.0], [3e6, 4e6], [0.0, 0.0], [5.0, 0.0], [50.0, 0.0]]
+    )
+    positions = torch.zeros(6, 2, requires_grad=True)
+    limited = LimitAdjoint.apply(positions, [4, 2], 2.0)
+    torch.testing.assert_close(limited, positions)
+    limited.backward(adjoint)
+    # Scene 0: median 1, so at most 2; scene 1: median 5, so at most 10. Directions stay.
+    expected = [[1.0, 0.0], [0.0, 1.0], [1.2, 1.6], [0.0, 0.0], [5.0, 0.0], [10.0, 0.0]]
+    torch.testing.assert_close(positions.grad, torch.tensor(expected))
