@@ -46,6 +46,7 @@ def session(device: str = "auto", threads: int = 1) -> Iterator[Ranks]:
         device: "auto" (CUDA if there is one), "cpu" or "cuda".
         threads: of this process, on a CPU.
     """
+    threads_before = torch.get_num_threads()
     world, rank = int(os.environ.get("WORLD_SIZE", 1)), int(os.environ.get("RANK", 0))
     cuda = torch.cuda.is_available() if device == "auto" else device == "cuda"
     if cuda:
@@ -64,6 +65,10 @@ def session(device: str = "auto", threads: int = 1) -> Iterator[Ranks]:
     finally:
         if started:
             dist.destroy_process_group()
+        if not cuda:
+            # Other code of this process expects the arithmetic that it came with.
+            torch.set_flush_denormal(False)
+            torch.set_num_threads(threads_before)
 
 
 def keep_heap() -> None:
