@@ -18,7 +18,7 @@ demo: .venv/.done
 	.venv/bin/gns-design optimize examples/flume.toml --budget 24 --verify 3 --out $(RUN)
 
 test: .venv/.done
-	.venv/bin/pytest --durations=15
+	$(PY) -m pytest --durations=15
 
 lint: .venv/.done
 	.venv/bin/ruff check .
