@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from gns_model.measures import WINDOW_LENGTH
 from gns_model.scene import Scene
 
 #: Relative change that a jittered start brings about by itself, doubled: two runs that differ by
@@ -63,8 +64,8 @@ def quantities(scene: Scene | None) -> list[Quantity]:
             1,
             3,
             -1,
-            "Deepest flow in the 10 cm before a baffle; without baffles the deepest in "
-            "windows of the same size.",
+            f"Deepest flow in the {100 * WINDOW_LENGTH:.0f} cm before a baffle; without baffles the "
+            "deepest in windows of the same size.",
         ),
         Quantity(
             "runout_p99",
