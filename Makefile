@@ -25,7 +25,8 @@ lint: .venv/.done
 	.venv/bin/mypy gns_model gns_env design
 
 benchmarks: .venv/.done
-	$(PY) benchmarks/run_all.py
+	$(PY) benchmarks/mpm.py
+	$(PY) benchmarks/upstream_depth.py
 
 clean:
 	rm -rf .venv runs build *.egg-info

@@ -64,8 +64,8 @@ def quantities(scene: Scene | None) -> list[Quantity]:
             1,
             3,
             -1,
-            f"Deepest flow in the {100 * WINDOW_LENGTH:.0f} cm before a baffle; without baffles the "
-            "deepest in windows of the same size.",
+            f"Deepest flow in the {100 * WINDOW_LENGTH:.0f} cm before a baffle; without baffles "
+            "the deepest in windows of the same size.",
         ),
         Quantity(
             "runout_p99",

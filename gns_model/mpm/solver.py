@@ -38,7 +38,7 @@ ABSURD = 10.0
 # one-thread rollouts then fight for all cores, many times slower. Its own layer leaves torch
 # alone; it takes one caller at a time, which the lock sees to.
 if "NUMBA_THREADING_LAYER" not in os.environ:
-    numba.config.THREADING_LAYER = "workqueue"
+    numba.config.THREADING_LAYER = "workqueue"  # type: ignore[attr-defined]
 _ONE_CALLER = threading.Lock()
 
 
@@ -172,7 +172,7 @@ class MpmSimulator:
         positions[0] = start.positions
         status = OK
         spare, spare_ids = np.empty_like(points), np.empty_like(ids)
-        threads = min(self.threads, numba.config.NUMBA_NUM_THREADS)
+        threads = min(self.threads, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
         threads_before = numba.get_num_threads()
         try:
             for frame in range(1, frames + 1):
@@ -227,7 +227,9 @@ def _lattice(scene: Scene, dx: float) -> tuple[Lattice, np.ndarray, np.ndarray]:
         origin[2] = 0.0
         walls.append(1)
     counts = [w + PADDING + 1 for w in walls[:dim]] + ([1] if dim == 2 else [])
-    return Lattice(dx, *map(float, origin), *counts, *walls, dim == 2), lower, upper
+    ox, oy, oz = map(float, origin)
+    lattice = Lattice(dx, ox, oy, oz, *counts, *walls, dim == 2)  # type: ignore[arg-type, call-arg]
+    return lattice, lower, upper
 
 
 def _one_thread() -> None:
