@@ -367,7 +367,7 @@ class Scene(_Part):
         try:
             return cls.model_validate(values)
         except ValidationError as error:
-            raise SceneError(f"{source}: {_first_fault(error)}") from None
+            raise SceneError(f"{source}: {first_fault(error)}") from None
 
     @classmethod
     def from_toml(cls, path: str | os.PathLike[str]) -> Scene:
@@ -426,16 +426,19 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _first_fault(error: ValidationError) -> str:
+def first_fault(
+    error: ValidationError, whole: str = "scene", keys: str = "gns_model/scene.py"
+) -> str:
+    """One line on the first thing that is wrong with a `whole`, whose keys stand in file `keys`."""
     fault = error.errors()[0]
-    key = ".".join(str(part) for part in fault["loc"]) or "scene"
+    key = ".".join(str(part) for part in fault["loc"]) or whole
     message = fault["msg"].removeprefix("Value error, ")
     if fault["type"] == "extra_forbidden":
-        return f"unknown key {key!r} (value {fault['input']!r}); see the keys in gns_model/scene.py"
+        return f"unknown key {key!r} (value {fault['input']!r}); see the keys in {keys}"
     if fault["type"] == "missing":
         return f"key {key!r} is missing"
     if fault["type"] == "value_error":
-        return message if key == "scene" else f"{key}: {message}"
+        return message if key == whole else f"{key}: {message}"
     return f"{key} = {fault['input']!r}: {message}"
 
 

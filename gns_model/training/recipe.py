@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from gns_model.errors import GnsError
 from gns_model.learned.config import ModelConfig
+from gns_model.scene import first_fault
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -112,17 +113,5 @@ class Recipe(BaseModel):
         try:
             return cls.model_validate(values)
         except ValidationError as error:
-            raise RecipeError(f"{source}: {_first_fault(error)}") from None
-
-
-def _first_fault(error: ValidationError) -> str:
-    fault = error.errors()[0]
-    key = ".".join(str(part) for part in fault["loc"])
-    message = fault["msg"].removeprefix("Value error, ")
-    if fault["type"] == "extra_forbidden":
-        return f"unknown key {key!r} (value {fault['input']!r})"
-    if fault["type"] == "missing":
-        return f"key {key!r} is missing"
-    if fault["type"] == "value_error":
-        return f"{key}: {message}" if key else message
-    return f"{key} = {fault['input']!r}: {message}"
+            fault = first_fault(error, "recipe", "gns_model/training/recipe.py")
+            raise RecipeError(f"{source}: {fault}") from None
