@@ -18,6 +18,10 @@ from torch.autograd.function import once_differentiable
 #: Edges of a tile: on a CPU its arrays shall fit the second-level cache, a GPU wants long ones.
 TILE = {"cpu": 2048, "cuda": 1 << 20}
 
+#: Edges up to which training in a short dtype keeps whatever autograd keeps instead of tiles: a
+#: fifth faster (0.38 s against 0.47 s at 58,000 edges, latent 64, 5 blocks) for more memory.
+PLAIN_TRAINING = 120_000
+
 _aten = torch.ops.aten
 _EPSILON = 1e-5  # LayerNorm's
 
@@ -58,7 +62,9 @@ def edge_mlp(
         of each receiver (N, L); without: message (E, L), and an empty tensor.
     """
     a, b = vertex_terms if vertex_terms is not None else (None, None)
-    if torch.compiler.is_compiling():  # the compiler fuses by itself, and cannot see into ours
+    training = torch.is_grad_enabled() and first.requires_grad and dtype != edge.dtype
+    # A compiler fuses by itself, and cannot see into ours.
+    if torch.compiler.is_compiling() or (training and len(edge) <= PLAIN_TRAINING):
         return _plain(
             edge, a, b, envelope, senders, receivers, activation, dtype, [first, *weights], biases,
             norm,

@@ -26,6 +26,7 @@ from gns_model.training.schedule import MovingAverage, learning_rate
 from gns_model.training.setup import card, check_resumable, open_data
 from gns_model.training.state import FILE, Position, load_state, read_position, save_state
 from gns_model.training.statistics import measure
+from gns_model.training.transfer import inherit
 from gns_model.training.validation import Scores, Validator
 
 #: Steps with a gradient that is not finite before a run gives up.
@@ -94,6 +95,9 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: threadin
             seed=recipe.seed,
         )
         statistics.apply(model)
+        if recipe.start_from is not None:
+            inherit(model, recipe.start_from)
+            average = MovingAverage(model, recipe.ema_decay)
         architecture = recipe.model.model_dump(mode="json")
         position = Position(0, 0.0, None, 0.0, 0.0, statistics, architecture, recipe.seed)
     if recipe.compile:

@@ -36,6 +36,9 @@ class Recipe(BaseModel):
     #: `limits` are filled in from the training scenes.
     model: ModelConfig = ModelConfig()
 
+    #: Begin with the weights of this model (shipped, or a checkpoint folder) instead of random ones.
+    start_from: str | None = None
+
     train: tuple[str, ...] = Field(min_length=1)  #: folders of trajectory files
     valid: tuple[str, ...] = ()  #: folders of held-out ones; without any, the last model is kept
     valid_rollouts: Count = 8  #: trajectories that a validation simulates, spread over the ranks
