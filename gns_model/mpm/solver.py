@@ -17,7 +17,15 @@ import numpy as np
 from gns_model.errors import SimulatorError
 from gns_model.mpm.contact import SKIN, solid_nodes
 from gns_model.mpm.material import material_constants, wave_speed
-from gns_model.mpm.transfer import COLUMNS, NODE_COLUMNS, PADDING, POSITION, Lattice, advance
+from gns_model.mpm.transfer import (
+    COLUMNS,
+    NODE_COLUMNS,
+    PADDING,
+    POSITION,
+    Lattice,
+    advance,
+    advance_serial,
+)
 from gns_model.particles import MOVING, fill
 from gns_model.scene import Scene
 from gns_model.simulator import Progress
@@ -176,11 +184,16 @@ class MpmSimulator:
         threads_before = numba.get_num_threads()
         try:
             for frame in range(1, frames + 1):
-                with _ONE_CALLER:
-                    numba.set_num_threads(threads)
-                    points, ids, spare, spare_ids = advance(
+                if threads == 1:
+                    points, ids, spare, spare_ids = advance_serial(
                         points, ids, spare, spare_ids, *arguments
                     )
+                else:
+                    with _ONE_CALLER:
+                        numba.set_num_threads(threads)
+                        points, ids, spare, spare_ids = advance(
+                            points, ids, spare, spare_ids, *arguments
+                        )
                 if not np.abs(points[:, 3:6]).max() < limit:  # False for NaN, too
                     status = DIVERGED
                     positions[frame:] = positions[frame - 1]

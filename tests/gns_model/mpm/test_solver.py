@@ -31,7 +31,7 @@ def scene(**changes):
 def final_points(monkeypatch):
     """The solver's own point arrays after every frame, by point: kept["points"] is the last."""
     kept = {"frames": []}
-    advance = solver.advance
+    advance = solver.advance_serial
 
     def spy(*arguments):
         result = advance(*arguments)
@@ -39,7 +39,7 @@ def final_points(monkeypatch):
         kept["frames"].append(kept["points"])
         return result
 
-    monkeypatch.setattr(solver, "advance", spy)
+    monkeypatch.setattr(solver, "advance_serial", spy)
     return kept
 
 
