@@ -34,6 +34,10 @@ class Family(StrEnum):
     random = "random"
     flume = "flume"
     layouts = "layouts"
+    columns = "columns"
+    friction = "friction"
+    barriers = "barriers"
+    rectangles = "rectangles"
 
 
 @app.command()
@@ -130,6 +134,9 @@ def generate(
     spacing: Annotated[
         float | None, typer.Option(help="Of the solver's points [m]; default: the paper's.")
     ] = None,
+    frame_interval: Annotated[
+        float, typer.Option(min=1e-6, help="Between stored frames [s].")
+    ] = 0.01,
     shard: Annotated[str, typer.Option(help="i/n: make every n-th trajectory from the i-th.")] = (
         "0/1"
     ),
@@ -147,6 +154,7 @@ def generate(
             count=count,
             seed=seed,
             spacing=spacing,
+            frame_interval=frame_interval,
             workers=workers,
             shard=parse_shard(shard),
             progress=lambda done, total: bar.update(task, completed=done, total=total),

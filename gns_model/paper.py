@@ -46,22 +46,36 @@ FLUME_FACTS = {
 }
 
 
-def column_scene(column: Column, *, base_friction: float = COLUMN_BASE_FRICTION) -> Scene:
-    """A granular column in plane strain. E is 20 MPa: the paper's 2 GPa costs 10 times as much."""
+#: Friction angles of the paper's multi-friction collapse [degrees].
+FRICTION_ANGLES = (15.0, 22.5, 30.0, 37.5, 45.0)
+
+
+def column_material(friction_angle: float = 30.0) -> dict[str, float]:
+    """The columns' grains. E is 20 MPa: the paper's 2 GPa costs 10 times as much for the same."""
+    return {
+        "density": 1800.0,
+        "youngs_modulus": 2.0e7,
+        "poisson_ratio": 0.3,
+        "friction_angle": friction_angle,
+        "cohesion": 100.0,
+        "tension_cutoff": 50.0,
+    }
+
+
+def column_scene(
+    column: Column,
+    *,
+    base_friction: float = COLUMN_BASE_FRICTION,
+    friction_angle: float = 30.0,
+) -> Scene:
+    """A granular column in plane strain, against the left wall."""
     return Scene.from_dict(
         {
             "name": f"column-a-{column.aspect:.1f}",
             "duration": 1.0,
             "domain": {"lower": (0.0, 0.0), "upper": column.domain},
             "friction": {"base": base_friction, "walls": 0.0},
-            "material": {
-                "density": 1800.0,
-                "youngs_modulus": 2.0e7,
-                "poisson_ratio": 0.3,
-                "friction_angle": 30.0,
-                "cohesion": 100.0,
-                "tension_cutoff": 50.0,
-            },
+            "material": column_material(friction_angle),
             "release": [
                 {
                     "lower": (0.0, 0.0),

@@ -1,6 +1,15 @@
 """Random scenes: what a learned simulator is trained and judged on.
 
-Three families, all with the material and friction of the paper's flume:
+The paper's three datasets (table "Training data"), with what its columns and its flume are made of:
+
+    columns     2D: a square of 0.2 to 0.3 m at a random place and velocity in a box of 1 m
+    friction    2D: the same with squares of 0.2 to 0.4 m, at 15, 22.5, 30, 37.5 and 45 degrees in
+                turn
+    barriers    3D: a cube of 0.2 to 0.4 m at a random place and velocity in a box of 0.8 m, with
+                one or two barriers of 0.1 x 0.3 x 0.1 m
+    rectangles  2D: a rectangle at rest against a wall, of random aspect: the paper's validation
+
+and three that are made for layouts of baffles in the flume:
 
     random   domain, release (size, place, height of fall, velocity) and one to four baffles of
              random size and place: the paper's barrier dataset, widened
@@ -16,13 +25,95 @@ from collections.abc import Callable
 import numpy as np
 
 from gns_model.errors import SceneError
+from gns_model.paper import COLUMN_BASE_FRICTION, FRICTION_ANGLES, column_material
 from gns_model.scene import Box, Scene
 
 #: How often a random baffle is drawn again before a scene does with fewer.
 TRIES = 50
 
 
-def random_scene(rng: np.random.Generator) -> Scene:
+def column_scene(rng: np.random.Generator, index: int) -> Scene:
+    """A scene of the family "columns"."""
+    return _square(rng, rng.uniform(0.2, 0.3), 30.0)
+
+
+def friction_scene(rng: np.random.Generator, index: int) -> Scene:
+    """A scene of the family "friction"."""
+    return _square(rng, rng.uniform(0.2, 0.4), FRICTION_ANGLES[index % len(FRICTION_ANGLES)])
+
+
+def rectangle_scene(rng: np.random.Generator, index: int) -> Scene:
+    """A scene of the family "rectangles"."""
+    height, aspect = rng.uniform(0.2, 0.4), np.exp(rng.uniform(np.log(0.6), np.log(3.5)))
+    length = max(0.08, height / aspect)
+    return _column_box((0.0, 0.0), (length, height), (0.0, 0.0), 30.0)
+
+
+def _square(rng: np.random.Generator, size: float, friction_angle: float) -> Scene:
+    """Half of them fly, half begin on the base, of which half at rest, as a column does."""
+    room = 1.0 - size
+    place = [rng.uniform(0, room), rng.uniform(0, room)]
+    velocity = [rng.uniform(-1.5, 1.5), rng.uniform(-1.5, 1.5)]
+    if rng.random() < 0.5:
+        place[1] = 0.0
+        velocity = [rng.uniform(-1.5, 1.5), 0.0]
+        if rng.random() < 0.5:
+            velocity = [0.0, 0.0]
+            if rng.random() < 0.5:
+                place[0] = 0.0
+    return _column_box(tuple(place), (size, size), tuple(velocity), friction_angle)
+
+
+def _column_box(
+    lower: tuple[float, ...],
+    size: tuple[float, ...],
+    velocity: tuple[float, ...],
+    friction_angle: float,
+) -> Scene:
+    upper = tuple(a + b for a, b in zip(lower, size, strict=True))
+    return Scene.from_dict(
+        {
+            "name": "column",
+            "duration": 1.0,
+            "domain": {"lower": (0.0, 0.0), "upper": (1.0, 1.0)},
+            "friction": {"base": COLUMN_BASE_FRICTION, "walls": 0.0},
+            "material": column_material(friction_angle),
+            "release": [{"lower": lower, "upper": upper, "velocity": velocity}],
+        }
+    )
+
+
+def barrier_scene(rng: np.random.Generator, index: int) -> Scene:
+    """A scene of the family "barriers"."""
+    size = rng.uniform(0.2, 0.4)
+    low, room = 0.1, 0.8 - size
+    corner = [low + rng.uniform(0, room), low, low + rng.uniform(0, room)]
+    if rng.random() < 0.4:
+        corner[1] += rng.uniform(0, min(0.2, room))
+    speed, heading = rng.uniform(0.5, 2.4), rng.uniform(0, 2 * np.pi)
+    return _with_random_baffles(
+        {
+            "name": "barriers",
+            "domain": {"lower": (low,) * 3, "upper": (low + 0.8,) * 3},
+            "release": [
+                {
+                    "lower": tuple(corner),
+                    "upper": tuple(c + size for c in corner),
+                    "velocity": (speed * np.cos(heading), 0.0, speed * np.sin(heading)),
+                }
+            ],
+            "duration": 0.87,
+        },
+        rng,
+        count=int(rng.integers(1, 3)),
+        size=lambda: (0.1, 0.3, 0.1),
+        gap=0.05,
+        earliest=low,
+        clear_of_release=True,
+    )
+
+
+def random_scene(rng: np.random.Generator, index: int) -> Scene:
     """A scene of the family "random"."""
     length, width = rng.uniform(0.8, 1.8), rng.uniform(0.5, 1.8)
     lower = np.array([0.1, 0.1, 0.1])
@@ -57,7 +148,7 @@ def random_scene(rng: np.random.Generator) -> Scene:
     )
 
 
-def flume_scene(rng: np.random.Generator) -> Scene:
+def flume_scene(rng: np.random.Generator, index: int) -> Scene:
     """A scene of the family "flume"."""
     length, height, width = 0.35, 0.25, 1.4
     length *= rng.uniform(0.85, 1.15)
@@ -79,7 +170,7 @@ def flume_scene(rng: np.random.Generator) -> Scene:
     )
 
 
-def layout_scene(rng: np.random.Generator) -> Scene:
+def layout_scene(rng: np.random.Generator, index: int) -> Scene:
     """A scene of the family "layouts"."""
     return _with_random_baffles(
         _flume(0.35, 0.25, 1.4, 2.0),
@@ -92,10 +183,15 @@ def layout_scene(rng: np.random.Generator) -> Scene:
     )
 
 
-FAMILIES: dict[str, Callable[[np.random.Generator], Scene]] = {
+#: By name. The place in the list is a part of the seed: new families go to the end.
+FAMILIES: dict[str, Callable[[np.random.Generator, int], Scene]] = {
     "random": random_scene,
     "flume": flume_scene,
     "layouts": layout_scene,
+    "columns": column_scene,
+    "friction": friction_scene,
+    "barriers": barrier_scene,
+    "rectangles": rectangle_scene,
 }
 
 
@@ -108,7 +204,7 @@ def draw(family: str, seed: int, index: int) -> Scene:
     if family not in FAMILIES:
         raise SceneError(f"no family of scenes named {family!r}: {', '.join(FAMILIES)}")
     key = [seed, index, list(FAMILIES).index(family)]
-    scene = FAMILIES[family](np.random.default_rng(key))
+    scene = FAMILIES[family](np.random.default_rng(key), index)
     return scene.replace(name=f"{family}-{seed}-{index}")
 
 
@@ -138,13 +234,24 @@ def _with_random_baffles(
     gap: float,
     earliest: float | None = None,
     latest: float | None = None,
+    clear_of_release: bool = False,
 ) -> Scene:
+    """`values` with up to `count` baffles, `gap` [m] apart, downstream of the release.
+
+    Args:
+        size: draws the size of a baffle [m].
+        earliest, latest: bounds of their faces along x [m]; default: the flow front, the far wall.
+        clear_of_release: instead of lying downstream they may stand anywhere beside the release.
+    """
     scene = Scene.from_dict(values)
     lower, upper = scene.domain.lower, scene.domain.upper
     first = earliest if earliest is not None else scene.front + 0.04
     last = min(latest if latest is not None else upper[0], upper[0])
     placed: list[dict] = []
     footprints: list[Box] = []
+    if clear_of_release:
+        for r in scene.releases:
+            footprints.append(Box(lower=(r.lower[0], r.lower[2]), upper=(r.upper[0], r.upper[2])))
     for _ in range(TRIES * count):
         if len(placed) == count:
             break

@@ -36,7 +36,7 @@ class Recipe(BaseModel):
     #: `limits` are filled in from the training scenes.
     model: ModelConfig = ModelConfig()
 
-    #: Begin with the weights of this model (shipped, or a checkpoint folder) instead of random ones.
+    #: Begin with the weights of this model (shipped, or a checkpoint folder), not random ones.
     start_from: str | None = None
 
     train: tuple[str, ...] = Field(min_length=1)  #: folders of trajectory files
@@ -62,7 +62,7 @@ class Recipe(BaseModel):
     early_steps: Count = 8  #: 0.16 s at a stride of 0.02 s: a release turns into a flow
     clip_norm: Positive = 1.0  #: of the whole gradient
     ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.999
-    mirror: bool = True  #: show every other window in a mirror across z; 3D only
+    mirror: bool = True  #: show every other window in a mirror (`augment`)
     statistics_windows: Count = 256  #: windows that the normalisation is measured on
 
     unroll: Count = 1  #: steps K of the unrolled phase
@@ -82,8 +82,6 @@ class Recipe(BaseModel):
     def _consistent(self) -> Recipe:
         if (self.steps is None) == (self.minutes is None):
             raise ValueError("give either steps or minutes, one of the two")
-        if self.mirror and self.model.dim != 3:
-            raise ValueError("mirror = true needs a 3D model; set mirror = false")
         if self.model.baffles == "points":
             raise ValueError('model.baffles = "points" is for imported weights, not for training')
         if self.model.types:

@@ -10,6 +10,7 @@ import torch
 from gns_model.data.windows import WindowIndex
 from gns_model.learned.graph import radius_graph
 from gns_model.learned.model import LearnedModel
+from gns_model.training.augment import mirror_axis
 
 #: Bins of time, from release to rest, in which the number of neighbours is averaged.
 TIME_BINS = 8
@@ -22,8 +23,8 @@ class Statistics:
     One deviation keeps the geometry: a rotation of a velocity rotates its normalised value.
 
     Attributes:
-        velocity_mean, acceleration_mean: [m/s], [m/s²], shape (D,). The mean across z is zero by
-            symmetry; where gravity is subtracted, the acceleration is a - g.
+        velocity_mean, acceleration_mean: [m/s], [m/s²], shape (D,). The mean along the mirror's
+            axis is zero by symmetry; where gravity is subtracted, the acceleration is a - g.
         velocity_std, acceleration_std: root mean square over the axes [m/s], [m/s²], noise of the
             training included.
         neighbours: mean number of edges of a point in each of TIME_BINS bins of time.
@@ -99,8 +100,8 @@ def measure(
             edges[time_bin(when)] += len(senders)
             points[time_bin(when)] += len(now)
     means = sums / max(1, count)
-    if index.dim == 3:
-        means[0, 2] = means[2, 2] = 0.0
+    axis = mirror_axis(index.dim)
+    means[0, axis] = means[2, axis] = 0.0
     velocity_variance = np.mean(np.maximum(0, means[1] - means[0] ** 2))
     acceleration_variance = np.mean(np.maximum(0, means[3] - means[2] ** 2))
     overall = edges.sum() / max(1.0, points.sum())

@@ -34,7 +34,6 @@ def test_there_are_recipes():
         ({"learning_rate": float("nan")}, "learning_rate"),
         ({"ema_decay": 1.0}, "ema_decay"),
         ({"schedule": "linear"}, "schedule"),
-        ({"model": {"dim": 2}}, "mirror"),
         ({"model": {"baffles": "points", "types": 9}}, "baffles"),
         ({"model": {"radius": 0.01}}, "radius"),
         ({"model": {"colour": "red"}}, "model.colour"),
