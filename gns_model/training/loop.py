@@ -106,6 +106,8 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: threadin
     validator = None
     if held_out is not None:
         validator = Validator(held_out, ranks, recipe.valid_rollouts, recipe.valid_windows)
+        if validator.ruler != position.ruler:
+            position.ruler, position.best_score = validator.ruler, None
     if ranks.rank == 0:
         out.mkdir(parents=True, exist_ok=True)
         write_whole(out / "recipe.json", recipe.model_dump_json(indent=2).encode())

@@ -122,10 +122,11 @@ def plot(out: Path) -> None:
     if checks:
         steps = [r["step"] for r in checks]
         left.plot(steps, [r["one_step"] for r in checks], "o-", label="held out, no noise")
-        for name in checks[0]:
+        for name in dict.fromkeys(name for row in checks for name in row):
             if name not in ("step", "seconds", "one_step", "slope", "diverged"):
                 style = {"color": "black", "lw": 2} if name == "score" else {"lw": 1}
-                right.plot(steps, [r[name] for r in checks], "o-", label=name, **style)
+                values = [r.get(name, float("nan")) for r in checks]
+                right.plot(steps, values, "o-", label=name, **style)
         right.set(xlabel="step", ylabel="error relative to truth; score", yscale="log")
         right.legend()
     left.set(xlabel="step", ylabel="loss", yscale="log")
@@ -137,27 +138,49 @@ def plot(out: Path) -> None:
 
 
 def _append(path: Path, row: Mapping[str, float]) -> None:
-    new = not path.exists()
+    """Add one row; the file is written anew if its columns are others."""
+    header = None
+    if path.exists():
+        with path.open(newline="", encoding="utf-8") as file:
+            header = next(csv.reader(file), None)
+    if header != list(row):
+        return _write(path, [*_read(path), dict(row)])
     with path.open("a", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        if new:
-            writer.writerow(row)
-        writer.writerow(f"{v:.7g}" for v in row.values())
+        csv.writer(file).writerow(f"{v:.7g}" for v in row.values())
+
+
+def _write(path: Path, rows: list[dict[str, float]]) -> None:
+    """Write rows whole; a column that a row lacks stays empty in it."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow(names)
+    for row in rows:
+        writer.writerow(f"{row[name]:.7g}" if name in row else "" for name in names)
+    write_whole(path, text.getvalue().encode())
 
 
 def _read(path: Path) -> list[dict[str, float]]:
+    """The rows of a log. A last one that was cut short, by a power cut say, is left out."""
     if not path.exists():
         return []
+    rows = []
     with path.open(newline="", encoding="utf-8") as file:
-        return [{k: float(v) for k, v in row.items()} for row in csv.DictReader(file)]
+        for row in csv.DictReader(file):
+            try:
+                rows.append({k: float(v) for k, v in row.items() if v != ""})
+            except (TypeError, ValueError):
+                continue
+    return rows
 
 
 def _keep_until(path: Path, step: int) -> None:
     """Drop the rows beyond `step`, or the file if none is left."""
-    rows = [row for row in _read(path) if row["step"] <= step]
-    path.unlink(missing_ok=True)
-    for row in rows:
-        _append(path, row)
+    rows = [row for row in _read(path) if row.get("step", step + 1) <= step]
+    if rows:
+        _write(path, rows)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _clock(seconds: float) -> str:

@@ -40,6 +40,7 @@ class Position:
         statistics: of the data; measured once.
         architecture: the model of the recipe, as JSON values.
         seed: of the run.
+        ruler: what `best_score` was measured by; scores by another ruler do not compare.
     """
 
     step: int
@@ -50,6 +51,7 @@ class Position:
     statistics: Statistics
     architecture: dict[str, Any]
     seed: int
+    ruler: str = ""
 
 
 def save_state(
