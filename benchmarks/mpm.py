@@ -9,6 +9,7 @@ import numpy as np
 
 from gns_model import paper
 from gns_model.mpm import MpmSimulator
+from gns_model.mpm.problem import DEFAULT_SPACING
 from gns_model.particles import fill
 
 
@@ -26,7 +27,7 @@ def solver_rate(scene, seconds_of_flow):
 def numpy_rate(scene, repeats=3):
     """The same for one scatter and gather of mass and momentum in NumPy, without any stress: a
     lower bound on what a plain NumPy solver would cost."""
-    points = fill(scene, MpmSimulator()._spacing(scene))
+    points = fill(scene, DEFAULT_SPACING[scene.dim])
     dim, dx = scene.dim, 2 * points.spacing
     shape = tuple(int(s / dx) + 6 for s in scene.domain.size)
     grid_position = (points.positions - scene.domain.lower) / dx + 2
