@@ -3,7 +3,8 @@
 The card (JSON, format `gns-model`, version 1) holds `name`, `config` (ModelConfig), `parameters`,
 `normalisation` (for reading; the model's own copy is in the weights), `weights_sha256`, and what
 the trainer adds: `trained_on`, `scores`, notes. Each file is written whole; the checksum tells a
-card from the weights of another save. Nothing is ever unpickled.
+card from the weights of another save. The weights carry a copy of their card and a checksum of
+their tensors, which count where a process was killed between the two files. Nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +21,7 @@ import torch
 from pydantic import ValidationError
 from safetensors import SafetensorError
 from safetensors.torch import load, save
+from torch import Tensor
 
 from gns_model.errors import FileFormatError, SimulatorError
 from gns_model.learned.config import ModelConfig
@@ -45,7 +49,6 @@ def save_model(
     """
     path = Path(path)
     state = {k: v.detach().cpu().contiguous() for k, v in model.state_dict().items()}
-    weights = save(state, metadata={"format": FORMAT, "version": str(VERSION)})
     added = {k: v for k, v in (card or {}).items() if k not in _OWN_KEYS}
     buffers = {k: v.tolist() for k, v in model.named_buffers()}
     content = {
@@ -56,11 +59,27 @@ def save_model(
         "config": model.config.model_dump(mode="json"),
         "parameters": sum(p.numel() for p in model.parameters()),
         "normalisation": {k: v for k, v in buffers.items() if k in state},
-        "weights_sha256": hashlib.sha256(weights).hexdigest(),
     }
+    metadata = {"format": FORMAT, "version": str(VERSION)}
+    metadata |= {"card": json.dumps(content, allow_nan=False), "tensors_sha256": _checksum(state)}
+    weights = save(state, metadata=metadata)
+    content["weights_sha256"] = hashlib.sha256(weights).hexdigest()
     text = json.dumps(content, indent=2, allow_nan=False) + "\n"  # before anything is written
-    write_whole(path / WEIGHTS, weights)
-    write_whole(path / CARD, text.encode())
+    if path.exists():
+        write_whole(path / WEIGHTS, weights)
+        write_whole(path / CARD, text.encode())
+        return path
+    # A folder that nobody ever meets without one of its files.
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fresh = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+    try:
+        fresh.chmod(0o755)
+        write_whole(fresh / WEIGHTS, weights)
+        write_whole(fresh / CARD, text.encode())
+        fresh.rename(path)
+    except BaseException:
+        shutil.rmtree(fresh, ignore_errors=True)
+        raise
     return path
 
 
@@ -106,19 +125,17 @@ def load_model(
     path = Path(path)
     card = read_card(path)
     try:
+        weights = (path / WEIGHTS).read_bytes()
+    except OSError as error:
+        raise FileFormatError(f"{path / WEIGHTS}: cannot be read ({error.strerror})") from None
+    if hashlib.sha256(weights).hexdigest() != card.get("weights_sha256"):
+        card = _card_within(path / WEIGHTS, weights)
+    try:
         config = ModelConfig.model_validate(card.get("config"))
     except ValidationError as error:
         fault = error.errors()[0]
         key = ".".join(str(part) for part in ("config", *fault["loc"]))
         raise FileFormatError(f"{path / CARD}: {key}: {fault['msg']}") from None
-    try:
-        weights = (path / WEIGHTS).read_bytes()
-    except OSError as error:
-        raise FileFormatError(f"{path / WEIGHTS}: cannot be read ({error.strerror})") from None
-    if hashlib.sha256(weights).hexdigest() != card.get("weights_sha256"):
-        raise FileFormatError(
-            f"{path / WEIGHTS}: truncated, or not the weights that {CARD} was written for"
-        )
     model = LearnedModel(config)
     try:
         model.load_state_dict(load(weights))
@@ -133,6 +150,34 @@ def load_model(
         raise SimulatorError(f"device {device!r} cannot be used: {reason}") from None
     name = str(card.get("name", path.name))
     return LearnedSimulator(model, name=name, card=card, **options)
+
+
+def _card_within(path: Path, weights: bytes) -> dict[str, Any]:
+    """The card that weights carry, for weights that the card beside them was not written for.
+
+    Raises:
+        FileFormatError: if they are truncated or carry none.
+    """
+    try:
+        state = load(weights)
+        size = int.from_bytes(weights[:8], "little")
+        metadata = json.loads(weights[8 : 8 + size])["__metadata__"]
+        card = json.loads(metadata["card"]) if metadata["tensors_sha256"] == _checksum(state) else 0
+    except (SafetensorError, KeyError, TypeError, ValueError):
+        card = 0
+    if not isinstance(card, dict):
+        raise FileFormatError(
+            f"{path}: truncated, or not the weights that {CARD} was written for"
+        ) from None
+    return card
+
+
+def _checksum(state: dict[str, Tensor]) -> str:
+    """SHA-256 of names and bytes of all tensors."""
+    digest = hashlib.sha256()
+    for name in sorted(state):
+        digest.update(name.encode() + state[name].numpy().tobytes())
+    return digest.hexdigest()
 
 
 def shipped_models() -> dict[str, Path]:
