@@ -15,7 +15,7 @@ import numba
 import numpy as np
 
 from gns_model.mpm.problem import DAMPING_RATE, Discretisation, pose, require_positive
-from gns_model.mpm.transfer import COLUMNS, NODE_COLUMNS, POSITION, advance
+from gns_model.mpm.transfer import COLUMNS, NODE_COLUMNS, POSITION, advance, advance_serial
 from gns_model.scene import Scene
 from gns_model.simulator import Progress
 from gns_model.trajectory import Trajectory
@@ -139,11 +139,16 @@ class MpmSimulator:
         threads_before = numba.get_num_threads()
         try:
             for frame in range(1, frames + 1):
-                with _ONE_CALLER:
-                    numba.set_num_threads(threads)
-                    points, ids, spare, spare_ids = advance(
+                if threads == 1:
+                    points, ids, spare, spare_ids = advance_serial(
                         points, ids, spare, spare_ids, *arguments
                     )
+                else:
+                    with _ONE_CALLER:
+                        numba.set_num_threads(threads)
+                        points, ids, spare, spare_ids = advance(
+                            points, ids, spare, spare_ids, *arguments
+                        )
                 if not np.abs(points[:, 3:6]).max() < problem.limit:  # False for NaN, too
                     bad_frame = frame
                     break
