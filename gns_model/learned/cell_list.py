@@ -60,7 +60,9 @@ def _grid(low, high, count, width):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def neighbours(positions, batch, n_batches, radius_squared, width, capacity):  # type: ignore[no-untyped-def]
+def neighbours(  # type: ignore[no-untyped-def]
+    positions, batch, n_batches, radius_squared, width, capacity, self_edges
+):
     """Edges sorted by receiver, then sender.
 
     Args:
@@ -70,6 +72,7 @@ def neighbours(positions, batch, n_batches, radius_squared, width, capacity):  #
         radius_squared: scalar of the positions' dtype [m²]; a pair closer than it is an edge.
         width: of a cell, a little more than the radius [m].
         capacity: room for edges in the answer.
+        self_edges: whether a point is its own neighbour.
 
     Returns:
         senders, receivers (both of length `capacity`) and the true number of edges; where that
@@ -123,7 +126,8 @@ def neighbours(positions, batch, n_batches, radius_squared, width, capacity):  #
                     dx = here[0] - placed[slot, 0]
                     dy = here[1] - placed[slot, 1]
                     dz = here[2] - placed[slot, 2]
-                    if dx * dx + dy * dy + dz * dz < radius_squared and order[slot] != i:
+                    other = order[slot] != i or self_edges
+                    if dx * dx + dy * dy + dz * dz < radius_squared and other:
                         if edges < capacity:
                             # Insertion keeps the senders of one receiver ascending.
                             j = edges

@@ -102,10 +102,17 @@ class ModelConfig(BaseModel):
     radius: Positive = 0.05  #: points closer than this are joined by an edge [m]
     history: Annotated[int, Field(ge=1)] = 3  #: number of past velocities that it sees
 
+    #: Points are their own neighbours, too, as in geoelements/gns.
+    self_edges: bool = False
+
     latent: Annotated[int, Field(ge=1)] = 64
+    hidden: Annotated[int, Field(ge=1)] | None = None  #: width of hidden layers; default: latent
     hidden_layers: Annotated[int, Field(ge=1)] = 2  #: of every MLP
     blocks: Annotated[int, Field(ge=1)] = 5  #: message-passing blocks, own weights each
     activation: Literal["silu", "relu"] = "silu"
+    #: How an edge goes on to the next block: "residual": plus its message. "doubled": times two,
+    #: a fault of geoelements/gns before December 2024 that weights of that time were trained with.
+    edge_update: Literal["residual", "doubled"] = "residual"
     #: Multiply messages by a smooth function of distance that vanishes at `radius`.
     envelope: bool = True
     #: Give edges the relative velocity beside the displacement.
@@ -116,9 +123,10 @@ class ModelConfig(BaseModel):
     #: "fade": smooth, vanishes at `wall_range`. "clip": the paper's distance / radius in [-1, 1].
     walls: Literal["fade", "clip"] = "fade"
     wall_range: Positive = 0.05  #: [m]
+    wall_clip: Positive = 1.0  #: where "clip" clips, in radii
     #: "distance": signed distance and normal to the exact boxes. "points": the paper's kinematic
-    #: points, which need `types`.
-    baffles: Literal["distance", "points"] = "distance"
+    #: points, which need `types`. "none": it sees no baffles, and refuses scenes that have some.
+    baffles: Literal["distance", "points", "none"] = "distance"
     baffle_range: Positive = 0.1  #: where the influence of a baffle on the features ends [m]
     #: Push points out of the boxes and into the domain after every step.
     project: bool = True
@@ -130,6 +138,9 @@ class ModelConfig(BaseModel):
 
     noise_std: NonNegative = 3e-4  #: of the random walk on the input positions in training [m]
     limits: Limits = Limits()
+    #: Lowest and highest coordinate of the domain [m], one pair an axis: where `predict_positions`
+    #: has the walls unless it is told otherwise.
+    bounds: tuple[Range, ...] | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> ModelConfig:
@@ -140,7 +151,16 @@ class ModelConfig(BaseModel):
                 f"radius {self.radius:g} m must exceed the spacing {self.spacing:g} m, "
                 "or no two points are joined"
             )
+        if self.bounds is not None and (
+            len(self.bounds) != self.dim or any(low >= high for low, high in self.bounds)
+        ):
+            raise ValueError(f"bounds must be {self.dim} ordered pairs, got {self.bounds}")
         return self
+
+    @property
+    def hidden_width(self) -> int:
+        """Width of the hidden layers of every MLP."""
+        return self.hidden or self.latent
 
     @property
     def vertex_inputs(self) -> int:

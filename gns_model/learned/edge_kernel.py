@@ -47,10 +47,10 @@ def edge_mlp(
 
     Args:
         edge: shape (E, K).
-        vertex_terms: a and b, each (N, L): the vertices' share of the first layer; or None.
+        vertex_terms: a and b, each (N, W): the vertices' share of the first layer; or None.
         envelope: factor of the messages in the sum, shape (E, 1), or None.
         senders, receivers: shape (E,).
-        first: weight of the first layer for the edge's own part, shape (L, K).
+        first: weight of the first layer for the edge's own part, shape (W, K).
         biases: of all layers, the first included.
         weights: of the layers after the first; the activation goes before each.
         norm: gain and shift of the LayerNorm.
@@ -106,7 +106,7 @@ def _plain(
     if a is None:
         return message, edge.new_zeros(0)
     weighted = message if envelope is None else message * envelope
-    return edge + message, add_messages(torch.zeros_like(a), receivers, weighted)
+    return edge + message, add_messages(edge.new_zeros(len(a), edge.shape[1]), receivers, weighted)
 
 
 class _Layers:
@@ -121,6 +121,10 @@ class _Layers:
         self.gain, self.shift = rest[-2:]
         self.silu = activation == "silu"
         self.dtype = dtype
+
+    def room(self, edges: int) -> list[Tensor]:
+        """Arrays for the values before each activation and before LayerNorm."""
+        return [bias.new_empty((edges, len(bias))) for bias in self.biases]
 
     def enter(
         self, edge: Tensor, a: Tensor | None, b: Tensor | None, to: Tensor, origin: Tensor
@@ -209,9 +213,9 @@ class _EdgeMLP(torch.autograd.Function):
         layers = _Layers(parameters, activation, dtype)
         low_a, low_b = (None, None) if a is None or b is None else (a.to(dtype), b.to(dtype))
         out = edge.new_empty((len(edge), len(layers.gain)))
-        total = edge.new_zeros(0) if a is None else torch.zeros_like(a)
+        total = edge.new_zeros(0) if a is None else edge.new_zeros((len(a), edge.shape[1]))
         trains = any(ctx.needs_input_grad[8:])
-        kept = [torch.empty_like(out, dtype=dtype) for _ in layers.biases] if trains else []
+        kept = layers.room(len(edge)) if trains else []
         moments = [out.new_empty((len(edge), 1)) for _ in range(2)] if trains else []
         for tile in _tiles(edge):
             to, origin = receivers[tile], senders[tile]
@@ -260,7 +264,7 @@ class _EdgeMLP(torch.autograd.Function):
                 message = layers.normalise(before[-1])[0] if need_envelope else None
             else:
                 hidden = layers.enter(own, low_a, low_b, to, origin)
-                before = [torch.empty_like(hidden) for _ in layers.biases]
+                before = layers.room(len(own))
                 message, mean, scale = layers.normalise(layers.forward(hidden, before))
             grad = grad_out[tile]
             if grad_a is not None and grad_b is not None:

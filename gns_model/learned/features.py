@@ -25,18 +25,18 @@ def envelope(relative_distance: Tensor) -> Tensor:
 
 
 def wall_features(
-    positions: Tensor, lower: Tensor, upper: Tensor, reach: float, *, clip: bool
+    positions: Tensor, lower: Tensor, upper: Tensor, reach: float, *, clip: float | None = None
 ) -> Tensor:
     """Nearness to the faces of the domain, first the lower ones, shape (N, 2D).
 
     Args:
         positions, lower, upper: [m], shape (N, D).
         reach: range [m].
-        clip: the paper's distance / reach clipped to [-1, 1] instead of a value that fades.
+        clip: the paper's distance / reach clipped to [-clip, clip] instead of a value that fades.
     """
     distance = torch.cat([positions - lower, upper - positions], dim=1)
-    if clip:
-        return (distance / reach).clamp(-1, 1)
+    if clip is not None:
+        return (distance / reach).clamp(-clip, clip)
     return fade(distance, reach)
 
 

@@ -15,7 +15,7 @@ _CELL_SLACK = 1.0 + 1e-4
 
 @torch.no_grad()
 def radius_graph(
-    positions: Tensor, radius: float, batch: Tensor | None = None
+    positions: Tensor, radius: float, batch: Tensor | None = None, *, self_edges: bool = False
 ) -> tuple[Tensor, Tensor]:
     """All ordered pairs of different points of one batch entry that are closer than `radius`.
 
@@ -26,10 +26,11 @@ def radius_graph(
         positions: [m], shape (N, D), float32 or float64, D = 2 or 3.
         radius: [m].
         batch: shape (N,), index of the scene of every point; default: all of one.
+        self_edges: add every (finite) point as a neighbour of itself.
 
     Returns:
         senders and receivers, int64, shape (E,), sorted by receiver and then by sender. Every edge
-        comes with its reverse; no point is its own neighbour.
+        comes with its reverse.
 
     Raises:
         ValueError: if shapes or dtypes are other than these.
@@ -46,8 +47,8 @@ def radius_graph(
         empty = torch.zeros(0, dtype=torch.int64, device=positions.device)
         return empty, empty
     if positions.device.type == "cpu" and _compiled() is not None:
-        return _numba_graph(positions, radius, batch)
-    return torch_radius_graph(positions, radius, batch)
+        return _numba_graph(positions, radius, batch, self_edges)
+    return torch_radius_graph(positions, radius, batch, self_edges=self_edges)
 
 
 @functools.cache
@@ -60,7 +61,9 @@ def _compiled():  # type: ignore[no-untyped-def]
     return neighbours
 
 
-def _numba_graph(positions: Tensor, radius: float, batch: Tensor | None) -> tuple[Tensor, Tensor]:
+def _numba_graph(
+    positions: Tensor, radius: float, batch: Tensor | None, self_edges: bool
+) -> tuple[Tensor, Tensor]:
     points = np.ascontiguousarray(positions.detach().numpy())
     if batch is None:
         index, n_batches = np.zeros(len(points), np.int64), 1
@@ -73,7 +76,7 @@ def _numba_graph(positions: Tensor, radius: float, batch: Tensor | None) -> tupl
     capacity = 32 * len(points)
     while True:
         senders, receivers, edges = _compiled()(
-            points, index, n_batches, squared, radius * _CELL_SLACK, capacity
+            points, index, n_batches, squared, radius * _CELL_SLACK, capacity, self_edges
         )
         if edges <= capacity:
             break
@@ -83,7 +86,7 @@ def _numba_graph(positions: Tensor, radius: float, batch: Tensor | None) -> tupl
 
 @torch.no_grad()
 def torch_radius_graph(
-    positions: Tensor, radius: float, batch: Tensor | None = None
+    positions: Tensor, radius: float, batch: Tensor | None = None, *, self_edges: bool = False
 ) -> tuple[Tensor, Tensor]:
     """`radius_graph` in torch operations: for CUDA, and for machines without numba."""
     device, n = positions.device, len(positions)
@@ -116,6 +119,6 @@ def torch_radius_graph(
         distance = torch.zeros(len(i), dtype=positions.dtype, device=device)
         for axis in range(positions.shape[1]):
             distance = distance + (positions[i, axis] - positions[j, axis]) ** 2
-        found.append((i * n + j)[(distance < squared) & (i != j)])
+        found.append((i * n + j)[(distance < squared) & ((i != j) | self_edges)])
     pairs = torch.cat(found).sort().values
     return pairs % n, pairs // n

@@ -37,9 +37,11 @@ class LearnedModel(nn.Module):
             config.edge_inputs,
             config.dim,
             latent=config.latent,
+            hidden=config.hidden_width,
             hidden_layers=config.hidden_layers,
             blocks=config.blocks,
             activation=config.activation,
+            edge_update=config.edge_update,
         )
         for name in ("velocity", "acceleration"):
             self.register_buffer(f"{name}_mean", torch.zeros(config.dim))
@@ -78,7 +80,9 @@ class LearnedModel(nn.Module):
         positions = history[:, -1]
         velocities = (history[:, 1:] - history[:, :-1]) / config.dt
         normalised = (velocities - self.velocity_mean) / self.velocity_std
-        senders, receivers = radius_graph(positions, config.radius, world.batch)
+        senders, receivers = radius_graph(
+            positions, config.radius, world.batch, self_edges=config.self_edges
+        )
         edge, distance = features.edge_features(
             positions,
             normalised[:, -1] if config.relative_velocity else None,
@@ -101,7 +105,7 @@ class LearnedModel(nn.Module):
                 world.point_lower,
                 world.point_upper,
                 config.radius if config.walls == "clip" else config.wall_range,
-                clip=config.walls == "clip",
+                clip=config.wall_clip if config.walls == "clip" else None,
             ),
         ]
         if config.baffles == "distance":
@@ -113,15 +117,15 @@ class LearnedModel(nn.Module):
             )
         if config.material_features:
             columns = [MATERIAL_FEATURES.index(name) for name in config.material_features]
-            parts.append(world.material[:, columns][world.batch])
+            parts.append(world.point_material[:, columns])
         if self.type_embedding is not None:
             parts.append(self.type_embedding(world.particle_type))
         return torch.cat(parts, dim=1)
 
-    def step(self, history: Tensor, world: World) -> Tensor:
+    def predict(self, history: Tensor, world: World) -> Tensor:
         """Positions one stride later [m], shape (N, D): semi-implicit Euler, then contact.
 
-        v' = v + a dt, p' = p + v' dt; kinematic points stay where they are.
+        v' = v + a dt, p' = p + v' dt, of kinematic points too.
         """
         config = self.config
         predicted = self.acceleration(history, world)
@@ -130,8 +134,11 @@ class LearnedModel(nn.Module):
             acceleration = acceleration + world.point_gravity
         before, now = history[:, -2], history[:, -1]
         after = now + ((now - before) + acceleration * config.dt**2)
-        if config.project:
-            after = project(now, after, world)
-        if config.baffles == "points":
-            after = torch.where(world.moving[:, None], after, now)
+        return project(now, after, world) if config.project else after
+
+    def step(self, history: Tensor, world: World) -> Tensor:
+        """`predict`, but kinematic points stay where they are."""
+        after = self.predict(history, world)
+        if self.config.baffles != "distance":
+            after = torch.where(world.moving[:, None], after, history[:, -1])
         return after

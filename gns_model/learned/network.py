@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import torch
@@ -22,13 +22,13 @@ class MLP(nn.Module):
         inputs: int,
         outputs: int,
         *,
-        latent: int,
+        hidden: int,
         hidden_layers: int,
         activation: str,
         norm: bool = True,
     ) -> None:
         super().__init__()
-        sizes = [inputs] + [latent] * hidden_layers + [outputs]
+        sizes = [inputs] + [hidden] * hidden_layers + [outputs]
         linear = [nn.Linear(a, b) for a, b in itertools.pairwise(sizes)]
         # A ModuleList registers them; typed as what it holds.
         self.layers: Sequence[nn.Linear] = nn.ModuleList(linear)  # type: ignore[assignment]
@@ -83,13 +83,14 @@ class MLP(nn.Module):
 class Block(nn.Module):
     """One round of message passing, with residuals on vertices and edges.
 
-    message = MLP(v_i, v_j, e_ij); v_i += MLP(v_i, sum_j envelope_ij message_ij); e_ij += message.
+    message = MLP(v_i, v_j, e_ij); v_i += MLP(v_i, sum_j envelope_ij message_ij); e_ij += message,
+    or, if `doubled`, e_ij += e_ij.
     """
 
-    def __init__(self, latent: int, hidden_layers: int, activation: str) -> None:
+    def __init__(self, latent: int, mlp: Callable[..., MLP], *, doubled: bool = False) -> None:
         super().__init__()
-        mlp = partial(MLP, latent=latent, hidden_layers=hidden_layers, activation=activation)
         self.latent = latent
+        self.doubled = doubled
         self.edge = mlp(3 * latent, latent)
         self.vertex = mlp(2 * latent, latent)
 
@@ -106,13 +107,13 @@ class Block(nn.Module):
         w_receiver, w_sender, w_edge = self.edge.split_first(*[self.latent] * 3)
         at_receiver = nn.functional.linear(vertex, w_receiver)
         at_sender = nn.functional.linear(vertex, w_sender)
-        edge, total = self.edge.over_edges(
+        updated, total = self.edge.over_edges(
             edge, senders, receivers, dtype, w_edge, (at_receiver, at_sender), envelope
         )
         w_vertex, w_total = self.vertex.split_first(*[self.latent] * 2)
         hidden = nn.functional.linear(vertex, w_vertex, self.vertex.layers[0].bias)
         hidden = hidden + nn.functional.linear(total, w_total)
-        return vertex + self.vertex.after_first(hidden), edge
+        return vertex + self.vertex.after_first(hidden), 2 * edge if self.doubled else updated
 
 
 class EncodeProcessDecode(nn.Module):
@@ -128,12 +129,17 @@ class EncodeProcessDecode(nn.Module):
         hidden_layers: int,
         blocks: int,
         activation: str,
+        hidden: int | None = None,
+        edge_update: str = "residual",
     ) -> None:
         super().__init__()
-        mlp = partial(MLP, latent=latent, hidden_layers=hidden_layers, activation=activation)
+        mlp = partial(
+            MLP, hidden=hidden or latent, hidden_layers=hidden_layers, activation=activation
+        )
+        doubled = edge_update == "doubled"
         self.encode_vertex = mlp(vertex_inputs, latent)
         self.encode_edge = mlp(edge_inputs, latent)
-        self.blocks = nn.ModuleList(Block(latent, hidden_layers, activation) for _ in range(blocks))
+        self.blocks = nn.ModuleList(Block(latent, mlp, doubled=doubled) for _ in range(blocks))
         self.decode = mlp(latent, outputs, norm=False)
 
     def forward(

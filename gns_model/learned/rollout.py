@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +14,7 @@ from torch.utils.checkpoint import checkpoint as rematerialise
 from gns_model.learned.config import ModelConfig
 from gns_model.learned.divergence import astray, speed_limit
 from gns_model.learned.model import LearnedModel
-from gns_model.learned.start import start
+from gns_model.learned.start import Start, start
 from gns_model.learned.world import World
 from gns_model.particles import Points
 from gns_model.scene import Scene
@@ -27,54 +28,54 @@ def frame_count(config: ModelConfig, scene: Scene) -> int:
 
 @torch.inference_mode()
 def roll_out(
-    model: LearnedModel, scenes: Sequence[Scene], points: Sequence[Points], advance: Progress
+    model: LearnedModel, scenes: Sequence[Scene], starts: Sequence[Start], advance: Progress
 ) -> tuple[list[np.ndarray], dict[int, int]]:
     """Run scenes as one block-diagonal batch.
 
     Args:
-        points: the moving points of each scene at t = 0.
+        starts: of each scene, on the device and in the dtype of the model.
         advance: called with the fraction done.
 
     Returns:
-        positions [m] of the moving points of each scene, (T, N, D) float32; and, of the scenes
-        that diverged, the first frame that was not good any more: from there on the last good one
-        is repeated.
+        positions [m] of the rows of each start, (T, N, D) float32; and, of the scenes that
+        diverged, the first frame that was not good any more: from there on the last good one is
+        repeated.
     """
-    config, place = model.config, _place(model)
-    moving = [len(p.positions) for p in points]
+    config = model.config
     frames = [frame_count(config, scene) for scene in scenes]
-    out = [np.empty((t, n, config.dim), np.float32) for t, n in zip(frames, moving, strict=True)]
+    out = [
+        np.empty((t, s.rows, config.dim), np.float32) for t, s in zip(frames, starts, strict=True)
+    ]
     diverged: dict[int, int] = {}
-    histories, types = start(config, scenes, points, **place)
-    for k, history in enumerate(histories):
-        out[k][0] = history[: moving[k], -1].cpu().numpy()
-    longest = torch.tensor([speed_limit(s) * config.dt for s in scenes], **place)
+    for found, begin in zip(out, starts, strict=True):
+        found[0] = begin.history[: begin.rows, -1].cpu().numpy()
+    longest = torch.tensor([speed_limit(s) * config.dt for s in scenes], **place(model))
 
     running = list(range(len(scenes)))
-    window = torch.cat(histories)
-    world = _world(scenes, types, place)
+    window = torch.cat([s.history for s in starts])
+    world = _world(scenes, starts, model)
     for frame in range(1, max(frames)):
         after = model.step(window, world)
         bad = astray(window[:, -1], after, world, longest[running])
         window = torch.cat([window[:, 1:], after[:, None]], dim=1)
-        sizes = [len(types[k]) for k in running]
+        counts = [len(starts[k].history) for k in running]
         going = []
-        for slot, (k, rows) in enumerate(zip(running, after.split(sizes), strict=True)):
+        for slot, (k, rows) in enumerate(zip(running, after.split(counts), strict=True)):
             if slot in bad:
                 diverged[k] = frame
                 out[k][frame:] = out[k][frame - 1]
                 continue
-            out[k][frame] = rows[: moving[k]].cpu().numpy()
+            out[k][frame] = rows[: starts[k].rows].cpu().numpy()
             if frame + 1 < frames[k]:
                 going.append(slot)
         if not going:
             break
         if len(going) < len(running):
             # Scenes that ended or diverged leave the batch; the rest do not notice.
-            parts = window.split(sizes)
+            parts = window.split(counts)
             window = torch.cat([parts[slot] for slot in going])
             running = [running[slot] for slot in going]
-            world = _world([scenes[k] for k in running], [types[k] for k in running], place)
+            world = _world([scenes[k] for k in running], [starts[k] for k in running], model)
         advance(frame / (max(frames) - 1))
     advance(1.0)
     return out, diverged
@@ -123,14 +124,14 @@ def roll_out_tensor(
     limit: float | None,
 ) -> list[Tensor]:
     """As `LearnedSimulator.rollout_tensor`, which see."""
-    config, place = model.config, _place(model)
-    moving = [len(p.positions) for p in points]
+    config = model.config
     lengths = [frames or frame_count(config, scene) for scene in scenes]
-    histories, types = start(config, scenes, points, centres, **place)
+    starts = start(config, scenes, points, centres, **place(model))
+    moving, histories = [s.rows for s in starts], [s.history for s in starts]
     if noise is not None:
         for history, shift, n in zip(histories, noise, moving, strict=True):
             history[:n] += shift.to(history)[:, None]
-    world = _world(scenes, types, place, centres)
+    world = _world(scenes, starts, model, centres)
     depth = config.history + 1
 
     def step(*past: Tensor) -> Tensor:
@@ -150,21 +151,23 @@ def roll_out_tensor(
     return [p[:t, :n] for p, t, n in zip(parts, lengths, moving, strict=True)]
 
 
-def _place(model: LearnedModel) -> dict:
+def place(model: LearnedModel) -> dict[str, Any]:
     """Device and dtype of the positions: those of the model."""
     return {"device": model.velocity_std.device, "dtype": model.velocity_std.dtype}
 
 
 def _world(
     scenes: Sequence[Scene],
-    types: Sequence[Tensor],
-    place: dict,
+    starts: Sequence[Start],
+    model: LearnedModel,
     centres: Sequence[Tensor] | None = None,
 ) -> World:
+    friction = [s.tan_friction for s in starts if s.tan_friction is not None]
     return World.from_scenes(
         scenes,
-        [len(kind) for kind in types],
+        [len(s.history) for s in starts],
         centres=centres,
-        particle_type=torch.cat(list(types)),
-        **place,
+        particle_type=torch.cat([s.particle_type for s in starts]),
+        tan_friction=torch.cat(friction) if len(friction) == len(starts) else None,
+        **place(model),
     )

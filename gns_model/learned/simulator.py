@@ -15,7 +15,9 @@ from torch import Tensor
 
 from gns_model.errors import SimulatorError
 from gns_model.learned.model import LearnedModel
-from gns_model.learned.rollout import frame_count, roll_out, roll_out_tensor
+from gns_model.learned.predict import Array, Bounds, predict_positions
+from gns_model.learned.rollout import frame_count, place, roll_out, roll_out_tensor
+from gns_model.learned.start import Start, start
 from gns_model.particles import MOVING, Points, fill, scatter
 from gns_model.scene import Scene
 from gns_model.simulator import Progress
@@ -83,6 +85,16 @@ class LearnedSimulator:
                 f"{self.name} is a {self.config.dim}D model and the scene {scene.name!r} is "
                 f"{scene.dim}D"
             )
+        if scene.baffles and self.config.baffles == "none":
+            raise SimulatorError(
+                f"{self.name} does not see baffles, and the scene {scene.name!r} has "
+                f"{len(scene.baffles)}"
+            )
+        if 0 < self.config.types <= MOVING:
+            raise SimulatorError(
+                f"{self.name} knows particle types 0 to {self.config.types - 1}, and the points of "
+                f"a scene are of type {MOVING}: use predict_positions with types of its own"
+            )
         for release in scene.releases:
             if min(release.size) < self.config.spacing:
                 fill(scene, self.config.spacing)  # raises the error that names the release
@@ -135,14 +147,15 @@ class LearnedSimulator:
 
             began = time.perf_counter()
             with self._settings():
-                positions, diverged = roll_out(
-                    self.model, [scenes[k] for k in group], [points[k] for k in group], advance
-                )
+                chosen = [scenes[k] for k in group]
+                starts = start(self.config, chosen, [points[k] for k in group], **place(self.model))
+                positions, diverged = roll_out(self.model, chosen, starts, advance)
             seconds = (time.perf_counter() - began) / len(group)
-            trajectories += [
-                self._trajectory(scenes[k], points[k], positions[j], diverged.get(j), seconds)
-                for j, k in enumerate(group)
-            ]
+            for j, k in enumerate(group):
+                found = self._trajectory(scenes[k], points[k].volume, positions[j], diverged.get(j))
+                found.settings["seconds"] = round(seconds, 4)
+                found.lattice = points[k].lattice
+                trajectories.append(found)
             done += share
         return trajectories
 
@@ -176,19 +189,65 @@ class LearnedSimulator:
             if self.threads is not None:
                 torch.set_num_threads(before)
 
-    def _trajectory(
+    def rollout_from(
         self,
         scene: Scene,
-        points: Points,
-        positions: np.ndarray,
-        diverged: int | None,
-        seconds: float,
+        history: np.ndarray,
+        particle_type: np.ndarray,
+        tan_friction: np.ndarray | None = None,
+        *,
+        frames: int | None = None,
+        progress: Progress | None = None,
     ) -> Trajectory:
-        settings: dict[str, Any] = {
-            "spacing": self.config.spacing,
-            "dt": self.config.dt,
-            "seconds": round(seconds, 4),
-        }
+        """Simulate on from points in motion instead of from the releases of `scene`.
+
+        Args:
+            scene: domain, gravity and baffles. Its releases are not filled.
+            history: positions [m], oldest first, one `config.dt` apart, shape (N, H + 1, D).
+            particle_type: shape (N,); points of type 3 stay where they are.
+            tan_friction: of every point, shape (N,); default: the scene's.
+            frames: number of frames, the last of the history included; default: the scene's
+                duration.
+            progress: called with the fraction done.
+
+        Returns:
+            all N points, in order; it may end "diverged", as with `rollout`.
+
+        Raises:
+            SimulatorError: if dimension or shapes do not fit the model.
+        """
+        config = self.config
+        shape = (len(particle_type), config.history + 1, config.dim)
+        if history.shape != shape or scene.dim != config.dim:
+            raise SimulatorError(
+                f"history must have shape {shape} in a {config.dim}D scene, got {history.shape} "
+                f"in a {scene.dim}D one"
+            )
+        if frames is not None:
+            scene = scene.replace(duration=max(1, frames - 1) * config.dt)
+        at = place(self.model)
+        friction = None if tan_friction is None else torch.from_numpy(tan_friction).to(**at)
+        begin = Start(
+            torch.from_numpy(history).to(**at),
+            torch.from_numpy(particle_type).to(at["device"], torch.int64),
+            len(history),
+            friction,
+        )
+        began = time.perf_counter()
+        with self._settings():
+            positions, diverged = roll_out(
+                self.model, [scene], [begin], progress or (lambda _fraction: None)
+            )
+        seconds = time.perf_counter() - began
+        found = self._trajectory(scene, config.spacing**config.dim, positions[0], diverged.get(0))
+        found.settings["seconds"] = round(seconds, 4)
+        found.particle_type = particle_type.astype(np.int8)
+        return found
+
+    def _trajectory(
+        self, scene: Scene, point_volume: float, positions: np.ndarray, diverged: int | None
+    ) -> Trajectory:
+        settings: dict[str, Any] = {"spacing": self.config.spacing, "dt": self.config.dt}
         if diverged is not None:
             settings["diverged_at"] = diverged * self.config.dt
         return Trajectory(
@@ -196,12 +255,48 @@ class LearnedSimulator:
             time=np.arange(len(positions)) * self.config.dt,
             particle_type=np.full(positions.shape[1], MOVING, np.int8),
             scene=scene,
-            point_volume=points.volume,
+            point_volume=point_volume,
             simulator=self.name,
             status=OK if diverged is None else DIVERGED,
             settings=settings,
-            lattice=points.lattice,
         )
+
+    # -- one step ------------------------------------------------------------------------------
+
+    def predict_positions(
+        self,
+        position_sequence: Array,
+        particle_type: np.ndarray | Tensor | Sequence[int] | None = None,
+        material: np.ndarray | Tensor | Sequence[float] | float | None = None,
+        *,
+        scene: Scene | None = None,
+        bounds: Bounds | None = None,
+    ) -> Array:
+        """Positions one step later, from the last ones: the call of geoelements/gns.
+
+        As there, stationary points (type 3) get the network's answer like all others; who knows
+        where they are puts them there.
+
+        Args:
+            position_sequence: [m], oldest first, one `config.dt` apart, shape (N, H + 1, D).
+            particle_type: shape (N,); default: all of type 6, which moves.
+            material: tan of the friction angle, shape (N,) or one number; needed by models that
+                see it unless there is a scene.
+            scene: what the points move in. Models that see baffles by their distance need it.
+            bounds: lowest and highest coordinate of the domain [m], shape (D, 2); default: those
+                of the scene, else those that the model was trained in.
+
+        Returns:
+            positions [m], shape (N, D), in the dtype of the model: an array for an array, a tensor
+            for a tensor, which autograd can differentiate.
+
+        Raises:
+            SimulatorError: one line on what does not fit the model or is missing.
+        """
+        with self._settings():
+            return predict_positions(
+                self.model, position_sequence, particle_type, material, scene=scene, bounds=bounds
+            )
 
     # -- gradients -----------------------------------------------------------------------------
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -13,6 +14,24 @@ from gns_model.particles import MOVING, STATIONARY, Points
 from gns_model.scene import Scene
 
 
+@dataclass(frozen=True)
+class Start:
+    """What a rollout of one scene begins with.
+
+    Attributes:
+        history: positions [m], oldest first, shape (N, H + 1, D).
+        particle_type: shape (N,).
+        rows: how many of the points, from the first, the trajectory is about. Kinematic points
+            that stand for baffles of the scene come after them.
+        tan_friction: of every point, shape (N,), where it is not the scene's.
+    """
+
+    history: Tensor
+    particle_type: Tensor
+    rows: int
+    tan_friction: Tensor | None = None
+
+
 def start(
     config: ModelConfig,
     scenes: Sequence[Scene],
@@ -21,8 +40,8 @@ def start(
     *,
     device: torch.device | str = "cpu",
     dtype: torch.dtype = torch.float32,
-) -> tuple[list[Tensor], list[Tensor]]:
-    """Histories and particle types of every scene at t = 0.
+) -> list[Start]:
+    """Every scene at t = 0.
 
     Before its release the mass moved as it moves at the release: the history is that motion
     extended backwards. Kinematic points, if the model wants them, come after the moving ones.
@@ -30,11 +49,8 @@ def start(
     Args:
         points: the moving points of each scene, at the spacing of the model.
         centres: of the baffles, in place of the scenes' own; only kinematic points read it.
-
-    Returns:
-        histories [m], (N, H + 1, D), and particle types, (N,), one of each a scene.
     """
-    histories, types = [], []
+    starts = []
     past = torch.arange(config.history, -1, -1, dtype=dtype, device=device)
     for k, (scene, begin) in enumerate(zip(scenes, points, strict=True)):
         position = torch.tensor(begin.positions, dtype=dtype, device=device)
@@ -47,6 +63,5 @@ def start(
             fixed = baffle_points(boxes, config.spacing)
             history = torch.cat([history, fixed[:, None].expand(-1, len(past), -1)])
             kind = torch.cat([kind, kind.new_full((len(fixed),), STATIONARY)])
-        histories.append(history)
-        types.append(kind)
-    return histories, types
+        starts.append(Start(history, kind, len(position)))
+    return starts

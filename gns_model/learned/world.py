@@ -18,7 +18,7 @@ FLUSH = 1e-6
 #: Where boxes that fill up a ragged batch stand [m]: beyond every range, and finite.
 _FAR = 1e6
 
-#: Columns of `World.material`.
+#: Columns of `World.material` and `World.point_material`.
 MATERIAL_FEATURES = ("tan_friction_angle", "base_friction")
 
 
@@ -34,6 +34,8 @@ class World:
         box_batch: scene of every baffle, int64, shape (K,).
         material: tan of the friction angle and base friction [-], shape (S, 2).
         particle_type: shape (N,); 6 moves, 3 is a kinematic point of a baffle.
+        tan_friction: of every point, shape (N,), where it is not its scene's.
+        point_material: `material` of every point, shape (N, 2).
         point_boxes: the baffles that each point may meet [m], shape (N, M, 2, D), M the most of
             any scene. Faces flush with the domain reach far beyond it: what is not a way out for
             a grain is not near for it either. Scenes with fewer have the rest far away.
@@ -47,10 +49,12 @@ class World:
     box_batch: Tensor
     material: Tensor
     particle_type: Tensor
+    tan_friction: Tensor | None = None
     point_boxes: Tensor = field(init=False)
     point_lower: Tensor = field(init=False)
     point_upper: Tensor = field(init=False)
     point_gravity: Tensor = field(init=False)
+    point_material: Tensor = field(init=False)
 
     def __post_init__(self) -> None:
         put = object.__setattr__  # the class is frozen; these follow from the other fields
@@ -58,6 +62,10 @@ class World:
         put(self, "point_lower", self.lower[self.batch])
         put(self, "point_upper", self.upper[self.batch])
         put(self, "point_gravity", self.gravity[self.batch])
+        material = self.material[self.batch]
+        if self.tan_friction is not None:
+            material = torch.cat([self.tan_friction[:, None], material[:, 1:]], dim=1)
+        put(self, "point_material", material)
 
     def _scene_boxes(self) -> Tensor:
         """Boxes by scene with flush faces extended, shape (S, M, 2, D)."""
@@ -90,6 +98,7 @@ class World:
         dtype: torch.dtype = torch.float32,
         centres: Sequence[Tensor] | None = None,
         particle_type: Tensor | None = None,
+        tan_friction: Tensor | None = None,
     ) -> World:
         """The world of a block-diagonal batch.
 
@@ -99,6 +108,8 @@ class World:
             centres: replaces the plan centres [m] of the baffles, one tensor (B, D-1) a scene;
                 everything that is computed in this world is then differentiable in them.
             particle_type: shape (N,); default: all points move.
+            tan_friction: tan of the friction angle of every point, shape (N,), in place of the
+                scenes' angles.
         """
         if centres is not None and len(centres) != len(scenes):
             raise ValueError(f"{len(scenes)} scenes, but centres for {len(centres)}")
@@ -119,6 +130,8 @@ class World:
         batch = torch.repeat_interleave(index, per_point)
         if particle_type is None:
             particle_type = torch.full_like(batch, MOVING)
+        if tan_friction is not None:
+            tan_friction = tan_friction.to(device=device, dtype=dtype)
         return cls(
             batch=batch,
             lower=_rounded(corner([s.domain.lower for s in scenes]), dtype, up=True),
@@ -132,7 +145,47 @@ class World:
                     for s in scenes
                 ]
             ),
+            particle_type=particle_type.to(device),
+            tan_friction=tan_friction,
+        )
+
+    @classmethod
+    def from_bounds(
+        cls,
+        bounds: Sequence[Sequence[float]],
+        particle_type: Tensor,
+        *,
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float32,
+        tan_friction: Tensor | None = None,
+    ) -> World:
+        """A domain without a scene, for points that came from elsewhere.
+
+        Gravity is 9.81 m/s² downwards, the friction of the base is not known and there are no
+        baffles but kinematic points.
+
+        Args:
+            bounds: lowest and highest coordinate [m], shape (D, 2).
+            particle_type: shape (N,).
+            tan_friction: of every point, shape (N,), if it is known.
+        """
+        corners = torch.tensor(bounds, dtype=torch.float64, device=device)
+        dim = len(corners)
+        gravity = torch.zeros((1, dim), dtype=dtype, device=device)
+        gravity[0, 1] = -9.81
+        particle_type = particle_type.to(device)
+        return cls(
+            batch=torch.zeros_like(particle_type, dtype=torch.int64),
+            lower=_rounded(corners[None, :, 0], dtype, up=True),
+            upper=_rounded(corners[None, :, 1], dtype, up=False),
+            gravity=gravity,
+            boxes=torch.zeros((0, 2, dim), dtype=dtype, device=device),
+            box_batch=torch.zeros(0, dtype=torch.int64, device=device),
+            material=torch.full((1, 2), math.nan, dtype=dtype, device=device),
             particle_type=particle_type,
+            tan_friction=(
+                None if tan_friction is None else tan_friction.to(device=device, dtype=dtype)
+            ),
         )
 
 

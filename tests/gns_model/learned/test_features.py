@@ -78,9 +78,11 @@ def test_baffle_features_end_at_their_range_and_turn_with_the_scene():
 def test_wall_features_paper_and_ours():
     points = torch.tensor([[0.01, 0.5]])
     lower, upper = torch.zeros(1, 2), torch.ones(1, 2)
-    clipped = wall_features(points, lower, upper, 0.04, clip=True)
+    clipped = wall_features(points, lower, upper, 0.04, clip=1.0)
     torch.testing.assert_close(clipped, torch.tensor([[0.25, 1, 1, 1]]))
-    faded = wall_features(points, lower, upper, 0.04, clip=False)
+    wider = wall_features(points, lower, upper, 0.04, clip=20.0)
+    torch.testing.assert_close(wider, torch.tensor([[0.25, 12.5, 20, 12.5]]))
+    faded = wall_features(points, lower, upper, 0.04)
     torch.testing.assert_close(faded, torch.tensor([[0.5625, 0, 0, 0]]))
 
 

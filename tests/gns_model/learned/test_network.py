@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 import torch
 from torch import nn
@@ -7,7 +9,7 @@ from torch import nn
 from gns_model.learned import edge_kernel
 from gns_model.learned.edge_kernel import add_messages
 from gns_model.learned.graph import radius_graph
-from gns_model.learned.network import Block, EncodeProcessDecode
+from gns_model.learned.network import MLP, Block, EncodeProcessDecode
 
 
 def test_worked_example_of_the_paper():
@@ -107,7 +109,7 @@ def test_edge_latents_change_in_every_block():
 
 
 def test_latents_of_an_isolated_vertex_do_not_depend_on_others():
-    block = Block(8, 2, "silu")
+    block = Block(8, partial(MLP, hidden=8, hidden_layers=2, activation="silu"))
     vertex, edge = torch.randn(3, 8), torch.randn(2, 8)
     senders, receivers = torch.tensor([0, 1]), torch.tensor([1, 0])
     one, _ = block(vertex, edge, senders, receivers, None, torch.float32)
