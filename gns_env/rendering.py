@@ -18,6 +18,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from gns_env.deposit import depth_map
 from gns_model.measures import moving_positions
 from gns_model.scene import Scene
 from gns_model.trajectory import Trajectory
@@ -36,21 +37,6 @@ LEAST_DEPTH = 0.002
 WIDTH, VIEW, LEFT, TOP, BOTTOM, BETWEEN, DPI = 6.4, 4.9, 0.62, 0.42, 0.5, 0.22, 100
 #: Views of very long or very short domains are kept between these heights [inch].
 SHORTEST, TALLEST = 0.6, 6.0
-
-
-def depth_map(trajectory: Trajectory, frame: int, cell: float) -> NDArray[np.float64]:
-    """Depth of material over the plan [m], cells of about `cell` [m], shape (nx,) or (nx, nz).
-
-    It is the volume of the points in a cell over its area, so it conserves mass; points outside
-    the domain (of a rollout that failed) are left out.
-    """
-    scene = trajectory.scene
-    plan = [0, *range(2, scene.dim)]
-    lower, upper = np.array(scene.domain.lower)[plan], np.array(scene.domain.upper)[plan]
-    shape = np.maximum(np.rint((upper - lower) / cell).astype(int), 1)
-    points = moving_positions(trajectory)[frame][:, plan]
-    counts, _ = np.histogramdd(points, bins=list(shape), range=list(zip(lower, upper, strict=True)))
-    return counts * (trajectory.point_volume / np.prod((upper - lower) / shape))
 
 
 def plan_view(axes: Axes, trajectory: Trajectory, frame: int = -1) -> PlanView:

@@ -7,30 +7,27 @@ from __future__ import annotations
 
 import math
 import os
-from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gns_env.cache import Keep, Outcome, RolloutCache, layout_key, scene_key, sorted_centres
+from gns_env.deposit import CELL, depth_map
 from gns_env.layout import LayoutSpace
 from gns_env.objective import Objective, ObjectiveError
 from gns_model import measures as hard
+from gns_model.particles import MOVING
 from gns_model.scene import Scene
 from gns_model.simulator import Progress, Simulator, load_simulator
 from gns_model.trajectory import DIVERGED, INTERRUPTED, OK, Trajectory
 
-#: Layouts closer than this in every coordinate are one layout [m].
-SAME_LAYOUT = 1e-6
 #: A rollout has failed in which more than this share of the points enters a baffle or ends more
 #: than LEAK_DEPTH [m] outside the domain; so has one that throws a grain a domain's length away.
 LEAK_SHARE, LEAK_DEPTH = 0.05, 0.01
 #: Status of such a rollout, beside those of `gns_model.trajectory`.
 LEAKED = "leaked"
-#: Evaluations and trajectories that a task remembers.
-REMEMBERED, KEPT_TRAJECTORIES = 10_000, 8
 
 
 @dataclass(frozen=True)
@@ -43,6 +40,8 @@ class Evaluation:
         cost: the objective; of several, their sum. Lower is better; a failure is finite too.
         costs: the cost under each objective.
         status: "ok", or how the rollout failed: "diverged", "interrupted" or "leaked".
+        deposit: depth where the material came to rest [m], see `gns_env.deposit`.
+        depths: peak depth upstream of each baffle [m], shape (n,), in the order of `centres`.
         trajectory: if it was asked for.
     """
 
@@ -51,6 +50,8 @@ class Evaluation:
     cost: float
     costs: tuple[float, ...]
     status: str
+    deposit: NDArray[np.float32]
+    depths: NDArray[np.float32]
     trajectory: Trajectory | None = None
 
     @property
@@ -68,6 +69,7 @@ class BaffleTask:
         n_baffles: how many to place.
         objective: what to make small; several for a Pareto front.
         device: torch device, if `simulator` is a name or a path.
+        cache: where rollouts are remembered; default: a cache of the task's own.
 
     Attributes:
         scene: the scene without baffles, its placement filled in.
@@ -90,6 +92,7 @@ class BaffleTask:
         n_baffles: int = 3,
         objective: Objective | Sequence[Objective] | None = None,
         device: str = "cpu",
+        cache: RolloutCache | None = None,
     ) -> None:
         self.space = LayoutSpace(scene, n_baffles)
         self.scene = scene.replace(baffles=(), placement=self.space.placement)
@@ -104,9 +107,9 @@ class BaffleTask:
         simulator.check(self.scene)
         self.simulator = simulator
         self.rollouts = self.failures = 0
-        self._evaluations: OrderedDict[bytes, Evaluation] = OrderedDict()
-        self._trajectories: OrderedDict[bytes, Trajectory] = OrderedDict()
-        self._nothing = _key(self._no_baffles())
+        self.cache = RolloutCache() if cache is None else cache
+        self._scene_key = scene_key(simulator, self.scene)
+        self._free: Outcome | None = None  # of the flow without baffles: always needed
 
     @property
     def objective(self) -> Objective:
@@ -120,7 +123,7 @@ class BaffleTask:
         Raises:
             ObjectiveError: if that rollout fails, for then nothing can be relative to it.
         """
-        return self.evaluate([self._no_baffles()])[0].measures
+        return self.evaluate([self.space.as_centres([])])[0].measures
 
     def scene_with(self, centres: ArrayLike) -> Scene:
         """The scene with baffles at `centres` [m], shape (k, D-1)."""
@@ -141,7 +144,7 @@ class BaffleTask:
 
         Args:
             layouts: centres of each layout.
-            trajectories: return each rollout's trajectory too; the last few are remembered.
+            trajectories: return each rollout's trajectory too; the last ones are remembered.
             progress: called with the fraction done.
 
         Raises:
@@ -152,96 +155,130 @@ class BaffleTask:
         if len(layouts) == 0:
             return []
         asked = [self.space.as_centres(layout) for layout in layouts]
-        keys = [_key(centres) for centres in asked]
-        nothing = self._nothing
-        wanted = dict(zip(keys, asked, strict=True))
-        if nothing not in self._evaluations:
-            wanted.setdefault(nothing, self._no_baffles())
-        found: dict[bytes, tuple[Evaluation, Trajectory | None]] = {}
-        missing: list[bytes] = []
-        for key in wanted:
-            if key in self._evaluations and (not trajectories or key in self._trajectories):
-                self._evaluations.move_to_end(key)
-                found[key] = self._evaluations[key], self._trajectories.get(key)
-            else:
-                missing.append(key)
-        if missing:
-            # Baffles in one order, so that the answer does not depend on the order asked for.
-            scenes = [self.scene_with(_sorted(wanted[key])) for key in missing]
-            results = self.simulator.rollout(scenes, progress=progress)
-            self.rollouts += len(results)
-            for key, trajectory in sorted(
-                zip(missing, results, strict=True), key=lambda pair: pair[0] != nothing
-            ):
-                evaluation = self._judge(wanted[key], trajectory, key == nothing)
-                self.failures += evaluation.failed
-                found[key] = evaluation, trajectory
-                self._remember(key, evaluation, trajectory if trajectories else None)
-        return [
-            replace(
-                found[key][0],
-                centres=centres.copy(),
-                measures=dict(found[key][0].measures),
-                trajectory=found[key][1] if trajectories else None,
-            )
-            for key, centres in zip(keys, asked, strict=True)
-        ]
+        keep: Keep = "whole" if trajectories else "nothing"
+        found = simulate([(self, centres) for centres in asked], keep=keep, progress=progress)
+        return [self.judge(c, *known) for c, known in zip(asked, found, strict=True)]
 
-    def _judge(
-        self, centres: NDArray[np.float64], trajectory: Trajectory, is_reference: bool
+    def judge(
+        self, centres: NDArray[np.float64], outcome: Outcome, trajectory: Trajectory | None = None
     ) -> Evaluation:
-        values, status = _finite_summary(trajectory)
-        if is_reference:
-            if status != OK:
-                raise ObjectiveError(
-                    f"the rollout of {self.simulator.name} without baffles ended as {status!r}, "
-                    "so no cost can be relative to it"
-                )
-            reference = values
-        else:
-            reference = self._evaluations[self._nothing].measures
+        """What an outcome of `simulate` is worth.
+
+        Raises:
+            ObjectiveError: as `evaluate`.
+        """
+        assert self._free is not None, "simulate() finds the free flow first"
+        if self._free.status != OK:
+            raise ObjectiveError(
+                f"the rollout of {self.simulator.name} without baffles ended as "
+                f"{self._free.status!r}, so no cost can be relative to it"
+            )
+        reference = self._free.measures
         costs = tuple(
-            objective.cost(values, reference) if status == OK else objective.failure_cost
+            objective.cost(outcome.measures, reference)
+            if outcome.status == OK
+            else objective.failure_cost
             for objective in self.objectives
         )
-        return Evaluation(centres, values, sum(costs), costs, status)
+        depths = np.zeros(len(centres), np.float32)
+        if len(centres):
+            depths[np.lexsort(centres.T[::-1])] = outcome.depths
+        return Evaluation(
+            centres=centres.copy(),
+            measures=dict(outcome.measures),
+            cost=sum(costs),
+            costs=costs,
+            status=outcome.status,
+            deposit=outcome.deposit.copy(),
+            depths=depths,
+            trajectory=trajectory,
+        )
 
-    def _remember(self, key: bytes, evaluation: Evaluation, trajectory: Trajectory | None) -> None:
-        if evaluation.status == INTERRUPTED:  # another time it may run to its end
-            return
-        self._evaluations[key] = evaluation
-        if trajectory is not None:
-            self._trajectories[key] = trajectory
-        for memory, size in (
-            (self._evaluations, REMEMBERED),
-            (self._trajectories, KEPT_TRAJECTORIES),
-        ):
-            while len(memory) > size:
-                oldest: Any = next(iter(memory))
-                if oldest == _key(self._no_baffles()):  # the reference is always needed
-                    memory.move_to_end(oldest)
-                    continue
-                del memory[oldest]
-
-    def _no_baffles(self) -> NDArray[np.float64]:
-        return np.zeros((0, self.scene.dim - 1))
+    def key(self, centres: NDArray[np.float64]) -> bytes:
+        """What the cache knows a layout of this task by."""
+        return self._scene_key + layout_key(centres)
 
 
-def _forget(memory: OrderedDict[bytes, Any], size: int, always: bytes) -> None:
-    """Drop the longest unused entries beyond `size`, but never that of the key `always`."""
-    if always in memory:
-        memory.move_to_end(always)
-    while len(memory) > size:
-        memory.popitem(last=False)
+def simulate(
+    wanted: Sequence[tuple[BaffleTask, NDArray[np.float64]]],
+    *,
+    keep: Keep = "nothing",
+    progress: Progress | None = None,
+) -> list[tuple[Outcome, Trajectory | None]]:
+    """Outcomes of layouts of several tasks that share one simulator, in one batch.
+
+    Each different rollout is run once, and none that a task's cache remembers. The flow without
+    baffles of every task joins the batch if it is not known.
+
+    Args:
+        wanted: tasks and centres [m], shape (k, D-1).
+        keep: what to keep and return of each trajectory.
+        progress: called with the fraction done.
+
+    Raises:
+        SceneError: if baffles overlap each other or a release, or leave the domain.
+    """
+    nothing = [
+        (task, task.space.as_centres([]))
+        for task in {id(task): task for task, _ in wanted}.values()
+        if task._free is None
+    ]
+    found: dict[bytes, tuple[Outcome, Trajectory | None]] = {}
+    missing: dict[bytes, tuple[BaffleTask, Scene]] = {}
+    for task, centres in [*wanted, *nothing]:
+        key = task.key(centres)
+        if key in found or key in missing:
+            continue
+        known = task.cache.find(key, keep)
+        if known is not None:
+            found[key] = known
+        elif len(centres) == 0 and task._free is not None and keep == "nothing":
+            found[key] = task._free, None
+        else:
+            missing[key] = task, task.scene_with(sorted_centres(centres))
+    if missing:
+        simulator = next(iter(missing.values()))[0].simulator
+        scenes = [scene for _, scene in missing.values()]
+        results = simulator.rollout(scenes, progress=progress)
+        for (key, (task, _)), trajectory in zip(missing.items(), results, strict=True):
+            outcome = _read(trajectory)
+            kept = _kept(trajectory, keep)
+            task.rollouts += 1
+            task.failures += outcome.status != OK
+            found[key] = outcome, kept
+            if outcome.status != INTERRUPTED:  # another time it may run to its end
+                task.cache.remember(key, outcome, keep, kept)
+    for task, none in nothing:
+        task._free = found[task.key(none)][0]
+    return [found[task.key(centres)] for task, centres in wanted]
 
 
-def _sorted(centres: NDArray[Any]) -> NDArray[Any]:
-    return centres[np.lexsort(centres.T[::-1])] if len(centres) else centres
+def _read(trajectory: Trajectory) -> Outcome:
+    values, status = _finite_summary(trajectory)
+    with np.errstate(over="ignore", invalid="ignore"):
+        depths = hard.upstream_depth_over_time(trajectory).max(axis=0)
+        deposit = depth_map(trajectory, -1, CELL)
+    if not trajectory.scene.baffles:
+        depths = depths[:0]  # the windows of a free flow belong to no baffle
+    return Outcome(
+        values, status, deposit.astype(np.float32), np.nan_to_num(depths).astype(np.float32)
+    )
 
 
-def _key(centres: NDArray[np.float64]) -> bytes:
-    rounded = np.rint(centres / SAME_LAYOUT).astype(np.int64)
-    return _sorted(rounded).tobytes()
+def _kept(trajectory: Trajectory, keep: Keep) -> Trajectory | None:
+    if keep != "rest":
+        return trajectory if keep == "whole" else None
+    # Two frames are enough to draw where it all came to rest, and how fast it still was.
+    positions = hard.moving_positions(trajectory)[-2:].copy()
+    return Trajectory(
+        positions=positions,
+        time=trajectory.time[-2:].copy(),
+        particle_type=np.full(positions.shape[1], MOVING, np.int8),
+        scene=trajectory.scene,
+        point_volume=trajectory.point_volume,
+        simulator=trajectory.simulator,
+        status=trajectory.status,
+    )
 
 
 def _finite_summary(trajectory: Trajectory) -> tuple[dict[str, float], str]:

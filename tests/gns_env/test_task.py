@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from gns_env.cache import RolloutCache
 from gns_env.objective import Objective, ObjectiveError
 from gns_env.task import BaffleTask
 from gns_model.errors import LayoutError, SceneError, SimulatorError
@@ -75,20 +76,16 @@ def test_what_is_returned_is_the_callers(small_flume: Scene, coarse_mpm: MpmSimu
     assert task.reference != {}
 
 
-def test_memory_is_bounded_and_keeps_the_reference(
-    small_flume: Scene, coarse_mpm: MpmSimulator, monkeypatch: pytest.MonkeyPatch
+def test_the_flow_without_baffles_is_never_forgotten(
+    small_flume: Scene, coarse_mpm: MpmSimulator
 ) -> None:
-    monkeypatch.setattr("gns_env.task.REMEMBERED", 3)
-    monkeypatch.setattr("gns_env.task.KEPT_TRAJECTORIES", 2)
-    task = BaffleTask(small_flume.replace(duration=0.15), coarse_mpm, n_baffles=1)
-    task.evaluate([[]], trajectories=True)
-    for x in np.linspace(0.45, 0.7, 5):
-        task.evaluate([[[x, 0.3]]], trajectories=True)
-    assert len(task._evaluations) == 3
-    assert len(task._trajectories) == 2
+    cache = RolloutCache(remembered=2)
+    task = BaffleTask(small_flume.replace(duration=0.15), coarse_mpm, n_baffles=1, cache=cache)
+    task.evaluate([[[x, 0.3]] for x in np.linspace(0.45, 0.7, 5)])
+    assert len(cache) == 2
     before = task.rollouts
-    assert task.evaluate([[]], trajectories=True)[0].trajectory is not None
-    assert task.rollouts == before
+    assert task.reference["centroid_travel"] > 0
+    assert task.rollouts == before == 6
 
 
 @pytest.mark.parametrize(
