@@ -12,7 +12,8 @@ import typer
 
 from gns_model import console
 from gns_model.errors import GnsError
-from gns_model.scene import Scene, write_whole
+from gns_model.scene import Scene
+from gns_model.suites.command import evaluate
 
 app = typer.Typer(
     add_completion=False,
@@ -182,58 +183,7 @@ def train(
         print(run(loaded, out, resume=resume))
 
 
-@app.command()
-def evaluate(
-    model: Annotated[str, typer.Argument(help="Shipped model, checkpoint folder, or mpm.")],
-    data: Annotated[Path, typer.Option(help="Folder of reference trajectories (HDF5).")],
-    out: Annotated[
-        Path | None, typer.Option(help="Folder for results.json, results.csv and figures.")
-    ] = None,
-    count: Annotated[int, typer.Option(min=1, help="Use at most so many trajectories.")] = 1000,
-    gradients: Annotated[
-        int, typer.Option(min=0, help="Scenes to check design gradients on, at full length.")
-    ] = 0,
-    workers: Workers = CORES,
-    as_json: Json = False,
-    quiet: Quiet = False,
-) -> None:
-    """Compare a simulator with reference trajectories that it has not seen."""
-    from gns_model.evaluation import compare, gradient_check
-    from gns_model.simulator import load_simulator
-    from gns_model.trajectory import Trajectory
-
-    simulator = load_simulator(model, workers=workers)
-    files = sorted(data.glob("*.h5"))[:count]
-    if not files:
-        raise GnsError(f"{data}: no trajectory files (*.h5)")
-    references = [Trajectory.load(file) for file in files]
-    with console.progress_bar(quiet=quiet) as bar:
-        task = bar.add_task(f"{model} on {len(files)} scenes", total=1.0)
-        comparison = compare(
-            simulator,
-            references,
-            batch=2 * workers,
-            progress=lambda f: bar.update(task, completed=f),
-        )
-    result = comparison.to_dict()
-    if gradients:
-        checks = [gradient_check(simulator, r.scene) for r in references[:gradients]]
-        result["gradient_cosine"] = [check.cosine for check in checks]
-    if out is not None:
-        from gns_model.evaluation_figures import deposit_figure, scatter_figure
-
-        write_whole(out / "results.json", json.dumps(result, indent=2).encode())
-        comparison.to_csv(out / "results.csv")
-        scatter_figure(comparison, out / "scatter.png")
-        deposit_figure(comparison, out / "deposits.png")
-    if as_json:
-        print(json.dumps(result, indent=2))
-        return
-    console.show(comparison.table())
-    if gradients:
-        print("cosine of gradient and central differences:", result["gradient_cosine"])
-    if out is not None:
-        print(f"results in {out}")
+app.command()(evaluate)
 
 
 def main() -> None:

@@ -1,0 +1,77 @@
+"""Columns of six aspect ratios: the paper's table "Normalized runout" and the figures around it."""
+
+from __future__ import annotations
+
+from gns_model import paper
+from gns_model.simulator import Simulator
+from gns_model.suites import column_figures, frames
+from gns_model.suites.collapse import (
+    collapse_curves,
+    collapse_row,
+    paper_columns,
+    runout_aims,
+)
+from gns_model.suites.pair import simulate
+from gns_model.suites.result import SuiteResult
+from gns_model.suites.setup import Setup
+
+#: Aspect ratios whose evolution is drawn: two short columns, the second the paper's, and its tall.
+DRAWN = (0.5, 0.8, 2.0)
+#: Aspect ratios of which the paper shows the flow at several times.
+FRAMED = (0.8, 2.0)
+
+SHOWN = (
+    ("aspect", "a = H0/L0", "g"),
+    ("runout_mpm", "our MPM", ".3f"),
+    ("runout", "learned", ".3f"),
+    ("runout_error", "error", "+.1%"),
+    ("paper_mpm", "paper's MPM", ".3f"),
+    ("paper_gns", "paper's GNS", ".3f"),
+    ("paper_error", "its error", "+.1%"),
+    ("position_mse", "position MSE [m²]", ".1e"),
+    ("seconds", "seconds", ".1f"),
+    ("status", "status", "s"),
+)
+
+
+def run(simulator: Simulator, setup: Setup) -> SuiteResult:
+    """Roll out the paper's six columns, 1 s each, and write `columns*.csv` and `columns*.png`.
+
+    Raises:
+        SimulatorError, SceneError: if the simulator cannot run them.
+    """
+    pairs = simulate(simulator, [paper.column_scene(c) for c in paper.COLUMNS], setup)
+    rows, curves = [], []
+    for column, pair in zip(paper.COLUMNS, pairs, strict=True):
+        rows.append(
+            {
+                "aspect": column.aspect,
+                "height_0": column.height,
+                "length_0": column.length,
+                **collapse_row(pair),
+                **paper_columns(column),
+                **pair.facts(),
+            }
+        )
+        curves.append(collapse_curves(pair, aspect=column.aspect))
+    by_aspect = dict(zip([c.aspect for c in paper.COLUMNS], pairs, strict=True))
+    out, name = setup.out, simulator.name
+    column_figures.runout_by_aspect(rows, name, out / "columns.png")
+    chosen = [c for c in curves if c[0]["aspect"] in DRAWN]
+    column_figures.evolution(chosen, name, out / "columns-evolution.png")
+    column_figures.position_errors(curves, name, out / "columns-position-error.png")
+    frames.deposits(by_aspect, name, out / "columns-deposits.png")
+    files = ["columns.png", "columns-evolution.png", "columns-position-error.png"]
+    files.append("columns-deposits.png")
+    for aspect in FRAMED:
+        files.append(f"columns-frames-a-{aspect:g}.png")
+        frames.collapse(by_aspect[aspect], name, out / files[-1])
+    return SuiteResult(
+        suite="columns",
+        title=f"Normalised runout of columns: {name} beside our MPM and the paper",
+        rows=rows,
+        shown=SHOWN,
+        aims=runout_aims(rows, pairs, "the aspect ratios"),
+        curves={"columns-curves": [row for curve in curves for row in curve]},
+        files=files,
+    )
