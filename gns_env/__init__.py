@@ -6,6 +6,7 @@ it by itself.
 
 import gymnasium
 
+from gns_env.cache import RolloutCache
 from gns_env.layout import LayoutSpace
 from gns_env.objective import FAILURE_COST, Objective, ObjectiveError
 from gns_env.task import BaffleTask, Evaluation
@@ -17,7 +18,12 @@ __all__ = [
     "LayoutSpace",
     "Objective",
     "ObjectiveError",
+    "RolloutCache",
 ]
 
 if "GranularBaffle-v0" not in gymnasium.registry:
-    gymnasium.register(id="GranularBaffle-v0", entry_point="gns_env.env:GranularBaffleEnv")
+    gymnasium.register(
+        id="GranularBaffle-v0",
+        entry_point="gns_env.env:GranularBaffleEnv",
+        vector_entry_point="gns_env.vector_env:GranularBaffleVectorEnv",
+    )

@@ -7,6 +7,8 @@ of milliseconds a frame.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -19,12 +21,13 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from gns_env.deposit import depth_map
-from gns_model.measures import moving_positions
+from gns_env.task import BaffleTask, Evaluation
+from gns_model.measures import WINDOW_LENGTH, moving_positions
 from gns_model.scene import Scene
 from gns_model.trajectory import Trajectory
 
 INK, MUTED, HAIRLINE = "#1d1b18", "#6d675d", "#cfc8bc"
-BAFFLE, GROUND = "#2f4858", "#f6f3ee"
+BAFFLE, GROUND, WATERMARK = "#2f4858", "#f6f3ee", "#1565a8"
 SAND = LinearSegmentedColormap.from_list(
     "sand", [GROUND, "#ecdcb8", "#dcae5c", "#b8722c", "#7c3f17", "#42200d"]
 )
@@ -33,6 +36,8 @@ SPEED = LinearSegmentedColormap.from_list("speed", ["#7c5a36", "#c98f45", "#e8c0
 TOP_SPEED = 2.0
 #: Depth [m] below which the plan shows the ground: less than a layer of single grains.
 LEAST_DEPTH = 0.002
+#: Labels of depths keep this far apart along x [m].
+LABEL_ROOM = 0.15
 #: A rendered frame [inch], at DPI dots an inch: its width, that of a view, and the margins.
 WIDTH, VIEW, LEFT, TOP, BOTTOM, BETWEEN, DPI = 6.4, 4.9, 0.62, 0.42, 0.5, 0.22, 100
 #: Views of very long or very short domains are kept between these heights [inch].
@@ -56,6 +61,22 @@ def side_view(axes: Axes, trajectory: Trajectory, frame: int = -1) -> SideView:
 def frame_image(trajectory: Trajectory, frame: int = -1) -> NDArray[np.uint8]:
     """One frame as RGB, shape (H, W, 3); for many frames of one trajectory keep a `Film`."""
     return Film(trajectory).image(frame)
+
+
+def rest_image(state: Evaluation, task: BaffleTask) -> NDArray[np.uint8]:
+    """Where the flow of `state` came to rest, as RGB, shape (H, W, 3), with the peak depth at every
+    baffle: written on it in the plan, a line upstream of its face in the side view.
+
+    Raises:
+        ValueError: if the evaluation holds no trajectory.
+    """
+    if state.trajectory is None:
+        raise ValueError("only an evaluation that kept its last frames can be drawn")
+    film = Film(state.trajectory)
+    film.mark_depths(state.depths[np.lexsort(state.centres.T[::-1])] if len(state.centres) else [])
+    placed = f"{len(state.centres)} of {task.space.n_baffles} baffles"
+    outcome = state.status if state.failed else f"cost {state.cost:.3f}"
+    return film.image(-1, f"{task.scene.name} ({task.simulator.name}): {placed}, {outcome}")
 
 
 class PlanView:
@@ -100,12 +121,29 @@ class PlanView:
         depth = gaussian_filter(depth_map(self.trajectory, frame, self.cell), 0.9, mode="reflect")
         self.image.set_data(np.where(depth < LEAST_DEPTH, 0.0, depth).T)
 
+    def mark_depths(self, depths: Sequence[float] | NDArray[np.float32]) -> None:
+        """Write the peak depth [m] at every baffle onto it."""
+        boxes = self.trajectory.scene.baffle_boxes()
+        for (low, high), depth in zip(boxes, depths, strict=True):
+            x, z = (low + high)[[0, 2]] / 2
+            self.image.axes.text(
+                x,
+                z,
+                f"{depth:.2f}",
+                color="white",
+                fontsize=6.5,
+                ha="center",
+                va="center",
+                zorder=5,
+            )
+
 
 class SideView:
     """The side of one trajectory in `axes`; `show(frame)` moves it to a frame."""
 
     def __init__(self, axes: Axes, trajectory: Trajectory) -> None:
         scene = trajectory.scene
+        self.axes = axes
         self.trajectory, self.positions = trajectory, moving_positions(trajectory)
         top = _side_top(scene)
         # Grains at the far side wall are drawn first, the near ones over them.
@@ -137,6 +175,29 @@ class SideView:
         moved = self.positions[max(frame, 1)] - self.positions[before]
         self.points.set_offsets(self.positions[frame, :, :2])
         self.points.set_array(np.linalg.norm(moved, axis=1) / interval)
+
+    def mark_depths(self, depths: Sequence[float] | NDArray[np.float32]) -> None:
+        """Draw the peak depth [m] at every baffle, as a line in the window where it is read."""
+        scene, axes = self.trajectory.scene, self.axes
+        boxes = scene.baffle_boxes()
+        labelled: list[float] = []
+        # The deepest first: of baffles behind one another in this view it has the label.
+        for k in np.argsort(-np.asarray(depths), kind="stable"):
+            face, height = boxes[k, 0, 0], scene.base + depths[k]
+            axes.plot([face - WINDOW_LENGTH, face], [height] * 2, color=WATERMARK, lw=2, zorder=5)
+            if all(abs(face - other) > LABEL_ROOM for other in labelled):
+                labelled.append(face)
+                axes.annotate(
+                    f"{depths[k]:.2f} m",
+                    (face - WINDOW_LENGTH / 2, height),
+                    (0, 2.5),
+                    textcoords="offset points",
+                    color=WATERMARK,
+                    fontsize=7.5,
+                    weight="bold",
+                    ha="center",
+                    zorder=5,
+                )
 
 
 class Film:
@@ -173,12 +234,17 @@ class Film:
             LEFT / WIDTH, 1 - 0.6 * TOP / height, "", color=INK, fontsize=10.5, weight="bold"
         )
 
-    def image(self, frame: int) -> NDArray[np.uint8]:
-        """RGB of one frame, shape (H, W, 3), freshly allocated."""
+    def mark_depths(self, depths: Sequence[float] | NDArray[np.float32]) -> None:
+        """Show the peak depth [m] upstream of every baffle of the scene, in the scene's order."""
+        for view in self.views:
+            view.mark_depths(depths)
+
+    def image(self, frame: int, title: str | None = None) -> NDArray[np.uint8]:
+        """RGB of one frame, shape (H, W, 3), freshly allocated, under `title` or name and time."""
         for view in self.views:
             view.show(frame)
         name, time = self.trajectory.scene.name, self.trajectory.time[frame]
-        self.title.set_text(f"{name} ({self.trajectory.simulator}), t = {time:.2f} s")
+        self.title.set_text(title or f"{name} ({self.trajectory.simulator}), t = {time:.2f} s")
         self.canvas.draw()
         return np.asarray(self.canvas.buffer_rgba())[:, :, :3].copy()
 
