@@ -1,26 +1,26 @@
 """One process, or several that average their gradients: torchrun's conventions, gloo or NCCL.
 
-The same script runs alone, under `torchrun` on one or more machines, and under `launch`, which
-starts local ranks with torchrun's environment variables.
+The same script runs alone, under `torchrun` on one or more machines, and under `launching.launch`,
+which starts local ranks with torchrun's environment variables.
 """
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
-import signal
-import socket
-import subprocess
-import sys
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 import torch.distributed as dist
 from torch import Tensor
+
+from gns_model.errors import GnsError
+from gns_model.training.heap import keep_heap
+
+
+class RankError(GnsError, RuntimeError):
+    """A rank that cannot run here, or one that the others have lost."""
 
 
 @dataclass(frozen=True)
@@ -32,10 +32,46 @@ class Ranks:
     device: torch.device
 
     def sum(self, values: Tensor) -> Tensor:
-        """`values` summed over all ranks, in place; same shape and dtype on every rank."""
+        """`values` summed over all ranks, in place; same shape and dtype on every rank.
+
+        Raises:
+            RankError: if another rank has ended.
+        """
         if self.world > 1:
-            dist.all_reduce(values)
+            with _lost():
+                dist.all_reduce(values)
         return values
+
+    @torch.no_grad()
+    def follow(self, tensors: Iterable[Tensor]) -> None:
+        """Overwrite `tensors` with those of rank 0."""
+        if self.world > 1:
+            with _lost():
+                for tensor in tensors:
+                    dist.broadcast(tensor, 0)
+
+    def share(self, content: bytes | None) -> bytes:
+        """The bytes that rank 0 gives, on every rank; what the others give does not count."""
+        if self.world == 1:
+            return content or b""
+        size = torch.tensor([len(content or b"")], device=self.device)
+        self.follow([size])
+        values = torch.zeros(int(size), dtype=torch.uint8, device=self.device)
+        if self.rank == 0 and content:
+            values.copy_(torch.frombuffer(bytearray(content), dtype=torch.uint8))
+        if len(values):
+            self.follow([values])
+        return values.cpu().numpy().tobytes()
+
+
+@contextlib.contextmanager
+def _lost() -> Iterator[None]:
+    """A connection that breaks in here means that a peer has gone."""
+    try:
+        yield
+    except RuntimeError as error:
+        reason = str(error).strip().splitlines() or [type(error).__name__]
+        raise RankError(f"lost the connection to another rank ({reason[0]})") from None
 
 
 @contextlib.contextmanager
@@ -45,12 +81,20 @@ def session(device: str = "auto", threads: int = 1) -> Iterator[Ranks]:
     Args:
         device: "auto" (CUDA if there is one), "cpu" or "cuda".
         threads: of this process, on a CPU.
+
+    Raises:
+        RankError: if there is no such device for this rank.
     """
     threads_before = torch.get_num_threads()
     world, rank = int(os.environ.get("WORLD_SIZE", 1)), int(os.environ.get("RANK", 0))
     cuda = torch.cuda.is_available() if device == "auto" else device == "cuda"
     if cuda:
-        place = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
+        local, count = int(os.environ.get("LOCAL_RANK", 0)), torch.cuda.device_count()
+        if local >= count:
+            raise RankError(
+                f'device = "{device}": rank {rank} needs GPU {local}, there are {count}'
+            )
+        place = torch.device("cuda", local)
         torch.cuda.set_device(place)
     else:
         place = torch.device("cpu")
@@ -59,7 +103,10 @@ def session(device: str = "auto", threads: int = 1) -> Iterator[Ranks]:
         keep_heap()
     started = world > 1 and not dist.is_initialized()
     if started:
-        dist.init_process_group("nccl" if cuda else "gloo", rank=rank, world_size=world)
+        if cuda:
+            dist.init_process_group("nccl", rank=rank, world_size=world, device_id=place)
+        else:
+            dist.init_process_group("gloo", rank=rank, world_size=world)
     try:
         yield Ranks(rank, world, place)
     finally:
@@ -69,99 +116,3 @@ def session(device: str = "auto", threads: int = 1) -> Iterator[Ranks]:
             # Other code of this process expects the arithmetic that it came with.
             torch.set_flush_denormal(False)
             torch.set_num_threads(threads_before)
-
-
-def keep_heap() -> None:
-    """Let glibc keep the memory of freed tensors for the next step.
-
-    By default every large tensor is mapped and unmapped anew, and the page faults cost more than
-    the arithmetic: a step with 58K edges took 1.4 to 1.7 s with MALLOC_MMAP_THRESHOLD_ = 4 MB and
-    0.65 s so. What fragmentation piles up goes back through `release_heap`.
-    """
-    mmap_max, trim_threshold = -4, -1  # M_MMAP_MAX, M_TRIM_THRESHOLD of <malloc.h>
-    with contextlib.suppress(OSError, AttributeError):
-        libc = ctypes.CDLL(None)
-        libc.mallopt(mmap_max, 0)
-        libc.mallopt(trim_threshold, 2**31 - 1)
-
-
-def release_heap() -> None:
-    """Give free memory back to the system, in the middle of the heap, too (glibc; else nothing)."""
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)
-
-
-def launch(
-    recipe: str | os.PathLike[str],
-    out: str | os.PathLike[str],
-    ranks: int,
-    *,
-    resume: bool = True,
-    threads: int = 1,
-    arguments: Sequence[str] = (),
-) -> int:
-    """Train on `ranks` local processes and wait for them.
-
-    SIGINT and SIGTERM are passed on: every rank finishes its step, the state is saved, and all
-    end. If one rank fails, the others are ended.
-
-    Args:
-        recipe: path of the recipe.
-        out: folder for the results.
-        ranks: number of processes.
-        resume: go on from the state in `out`, if there is one.
-        threads: of every rank.
-        arguments: further arguments of `python -m gns_model.training`.
-
-    Returns:
-        0, or the exit code of the first rank that failed.
-    """
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    command = [sys.executable, "-m", "gns_model.training", str(recipe), "--out", str(out)]
-    command += ["--resume" if resume else "--no-resume", *arguments]
-    root = str(Path(__file__).resolve().parents[2])
-    processes = []
-    for rank in range(ranks):
-        environment = dict(
-            os.environ,
-            RANK=str(rank),
-            LOCAL_RANK=str(rank),
-            WORLD_SIZE=str(ranks),
-            MASTER_ADDR="127.0.0.1",
-            MASTER_PORT=str(port),
-            OMP_NUM_THREADS=str(threads),
-            NUMBA_NUM_THREADS=str(threads),
-            PYTHONPATH=os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")])),
-        )
-        # Its own process group, so that Ctrl-C reaches a rank once: from here.
-        processes.append(subprocess.Popen(command, env=environment, start_new_session=True))
-
-    def pass_on(number: int, _frame: object) -> None:
-        for process in processes:
-            if process.poll() is None:
-                process.send_signal(number)
-
-    before = {s: signal.signal(s, pass_on) for s in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        while True:
-            codes = [process.poll() for process in processes]
-            failed = [code for code in codes if code]
-            if failed:
-                pass_on(signal.SIGTERM, None)
-                deadline = time.monotonic() + 30
-                for process in processes:
-                    with contextlib.suppress(subprocess.TimeoutExpired):
-                        process.wait(max(0.1, deadline - time.monotonic()))
-                    process.kill()
-                return failed[0]
-            if all(code == 0 for code in codes):
-                return 0
-            time.sleep(0.1)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        for process in processes:
-            if process.poll() is None:
-                process.kill()

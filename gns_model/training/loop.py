@@ -3,40 +3,35 @@
 from __future__ import annotations
 
 import os
-import signal
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
-from gns_model.errors import GnsError
+from gns_model.data.windows import WindowIndex
 from gns_model.learned.checkpoint import save_model
-from gns_model.learned.config import Limits
 from gns_model.learned.model import LearnedModel
 from gns_model.scene import write_whole
 from gns_model.training import batches
-from gns_model.training.distributed import Ranks, release_heap, session
+from gns_model.training.claim import TrainingError, claim, tidy
+from gns_model.training.distributed import RankError, Ranks, session
+from gns_model.training.heap import release_heap
+from gns_model.training.launching import end_with_launcher
 from gns_model.training.loss import unrolled_loss
 from gns_model.training.progress import Display
 from gns_model.training.recipe import Recipe
-from gns_model.training.schedule import MovingAverage, learning_rate
-from gns_model.training.setup import card, check_resumable, open_data
-from gns_model.training.state import FILE, Position, load_state, read_position, save_state
-from gns_model.training.statistics import measure
-from gns_model.training.transfer import inherit
+from gns_model.training.schedule import learning_rate
+from gns_model.training.setup import Run, begin, card, open_data
+from gns_model.training.state import FILE, save_state
+from gns_model.training.stopping import Abandoned, Stop, stop_on_signals
 from gns_model.training.validation import Scores, Validator
 
 #: Steps with a gradient that is not finite before a run gives up.
 PATIENCE = 20
 #: Steps between two looks for memory to give back to the system.
 TIDY = 50
-
-
-class TrainingError(GnsError, RuntimeError):
-    """Training that cannot go on; what was saved is kept."""
 
 
 def train(recipe: Recipe, out: str | os.PathLike[str], *, resume: bool = True) -> Path:
@@ -61,45 +56,31 @@ def train(recipe: Recipe, out: str | os.PathLike[str], *, resume: bool = True) -
         FileFormatError: for a data file or state that is truncated or foreign.
         RecipeError: if the state in `out` is of another model or seed, or data and model differ
             in dimension.
-        TrainingError: if the loss stays not finite.
+        TrainingError: if the loss stays not finite, or another run trains in `out`.
+        RankError: if there is no such device, or another rank has died; what was saved is kept.
+        KeyboardInterrupt: if it is told to stop before the first step.
     """
-    with session(recipe.device, recipe.threads) as ranks, _stop_signal() as stop:
-        return _train(recipe, Path(out), resume, ranks, stop)
+    folder = Path(out)
+    with stop_on_signals() as stop, session(recipe.device, recipe.threads) as ranks:
+        end_with_launcher()
+        with claim(folder, stop) if ranks.rank == 0 else nullcontext():
+            return _train(recipe, folder, resume, ranks, stop)
 
 
-def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: threading.Event) -> Path:
-    # -- data ----------------------------------------------------------------------------------
-    data = open_data(recipe, recipe.train)
-    held_out = open_data(recipe, recipe.valid) if recipe.valid else None
-
-    # -- model ---------------------------------------------------------------------------------
-    torch.manual_seed(recipe.seed)
-    limits = Limits.of(source.scene for source in data.sources)
-    config = recipe.model.model_copy(update={"limits": limits})
-    model = LearnedModel(config).to(ranks.device)
-    average = MovingAverage(model, recipe.ema_decay)
-    optimiser = torch.optim.AdamW(
-        model.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay
-    )
+def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: Stop) -> Path:
+    # -- data and model ------------------------------------------------------------------------
     state_file = out / FILE
-    if resume and state_file.exists():
-        check_resumable(recipe, read_position(state_file))
-        position = load_state(state_file, model, average, optimiser)
-    else:
-        statistics = measure(
-            data,
-            windows=recipe.statistics_windows,
-            radius=config.radius,
-            noise_std=config.noise_std,
-            subtract_gravity=config.subtract_gravity,
-            seed=recipe.seed,
-        )
-        statistics.apply(model)
-        if recipe.start_from is not None:
-            inherit(model, recipe.start_from)
-            average = MovingAverage(model, recipe.ema_decay)
-        architecture = recipe.model.model_dump(mode="json")
-        position = Position(0, 0.0, None, 0.0, 0.0, statistics, architecture, recipe.seed)
+    try:
+        with stop.may_abandon():
+            data = open_data(recipe, recipe.train)
+            held_out = open_data(recipe, recipe.valid) if recipe.valid else None
+            run = begin(recipe, data, state_file, ranks, resume)
+    except (Abandoned, RankError):
+        if stop.requested:
+            raise KeyboardInterrupt from None  # nothing to save yet
+        raise
+    model, average, optimiser, position = run.model, run.average, run.optimiser, run.position
+    config = model.config
     if recipe.compile:
         model.network.compile(dynamic=True)
     judged = LearnedModel(config).to(ranks.device)  # holds the moving average
@@ -109,7 +90,7 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: threadin
         if validator.ruler != position.ruler:
             position.ruler, position.best_score = validator.ruler, None
     if ranks.rank == 0:
-        out.mkdir(parents=True, exist_ok=True)
+        tidy(out)
         write_whole(out / "recipe.json", recipe.model_dump_json(indent=2).encode())
 
     def save(folder: str, scores: Scores | None) -> None:
@@ -124,29 +105,31 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: threadin
             save("last", None)
             save_state(state_file, position, model, average, optimiser)
 
-    def validate() -> None:
+    def validate() -> bool:
+        """Whether it was finished."""
         assert validator is not None
         judged.load_state_dict(model.state_dict())
         average.copy_to(judged)
-        scores = validator(judged, stop.is_set)
+        with stop.may_abandon():
+            scores = validator(judged, lambda: stop.requested, display.validating)
         # Rank 0's time for all, or they would disagree about when the next one is due.
         now = torch.zeros(1, device=ranks.device)
         now += clock.read() if ranks.rank == 0 else 0.0
         position.seconds = position.validated_at = float(ranks.sum(now))
-        if not scores.complete:
-            return
-        display.validation(position.step, position.seconds, scores.row())
-        if position.best_score is None or scores.score < position.best_score:
-            position.best_score = scores.score
-            save("model", scores)
+        if scores.complete:
+            display.validation(position.step, position.seconds, scores.row())
+            if position.best_score is None or scores.score < position.best_score:
+                position.best_score = scores.score
+                save("model", scores)
+                save_all()  # or a run that is killed now would forget which score to beat
+        return scores.complete
 
     # -- steps ---------------------------------------------------------------------------------
     budget = recipe.steps if recipe.steps is not None else 60 * (recipe.minutes or 0)
     clock = _Clock(position.seconds)
     parameters = [p for p in model.parameters() if p.requires_grad]
     sizes = [p.numel() for p in parameters]
-    autocast = recipe.precision == "bfloat16"
-    started_at, bad, interrupted = position.step, 0, False
+    started_at, bad = position.step, 0
     unit, scale = ("steps", 1.0) if recipe.steps is not None else ("minutes", 60.0)
     with Display(out, ranks, step=position.step, total=budget / scale, unit=unit) as display:
         if ranks.rank == 0:
@@ -157,107 +140,126 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: threadin
                 + f", {ranks.world} rank(s)"
                 + (f", resumed at step {position.step}" if position.step else "")
             )
-        while (done := position.step if recipe.steps else position.seconds) < budget:
-            began = time.perf_counter()
-            progress = done / budget
-            steps = 1
-            if progress >= 1 - recipe.unroll_fraction and recipe.unroll > 1:
-                rng = batches.generator(recipe.seed, batches.UNROLL, position.step)
-                steps = int(rng.integers(1, recipe.unroll + 1))
-            drawn = batches.draw(
-                data,
-                batches.generator(recipe.seed, batches.DRAW, position.step),
-                ranks=ranks.world,
-                edges_per_batch=recipe.edges_per_batch,
-                statistics=position.statistics,
-                mirror=recipe.mirror,
-                early=recipe.early,
-                early_steps=recipe.early_steps,
-                unroll=steps,
-            )[ranks.rank]
-            batch = batches.collate(
-                [batches.read(data, item, unroll=steps) for item in drawn],
-                noise_std=config.noise_std,
-                rng=batches.generator(recipe.seed, batches.NOISE, position.step, ranks.rank),
-                device=ranks.device,
-            )
-            rate = learning_rate(recipe, position.step, progress)
-            for group in optimiser.param_groups:
-                group["lr"] = rate
-            with torch.autocast(ranks.device.type, torch.bfloat16) if autocast else nullcontext():
-                loss = unrolled_loss(
-                    model,
-                    batch,
-                    steps=steps,
-                    backprop=recipe.backprop_through_unroll,
-                    linear_beyond=recipe.linear_beyond,
-                    momentum_weight=recipe.momentum_weight,
-                )
-            optimiser.zero_grad(set_to_none=True)
-            loss.backward()
+        try:
+            while (done := position.step if recipe.steps else position.seconds) < budget:
+                began = time.perf_counter()
+                progress = done / budget
+                with stop.may_abandon():
+                    loss, edges = _forward_and_backward(run, recipe, data, ranks, progress)
+                rate = learning_rate(recipe, position.step, progress)
 
-            # One message carries the gradients and all that the ranks have to agree on.
-            edges = sum(item.edges for item in drawn)
-            now = clock.read() if ranks.rank == 0 else 0.0
-            facts = [loss.item(), edges, now, float(stop.is_set())]
-            message = torch.cat(
-                [(torch.zeros_like(p) if p.grad is None else p.grad).flatten() for p in parameters]
-                + [torch.tensor(facts, dtype=torch.float32, device=ranks.device)]
-            )
-            ranks.sum(message)
-            gradient = message[: -len(facts)] / ranks.world
-            loss_sum, edges, seconds, stopped = message[-len(facts) :].tolist()
-            norm = gradient.norm().item()
-            finite = norm < float("inf")  # False for NaN, too
-            if finite:
-                gradient *= min(1.0, recipe.clip_norm / (norm + 1e-12))
-                for p, part in zip(parameters, gradient.split(sizes), strict=True):
-                    p.grad = part.view_as(p)
-                optimiser.step()
-                average.update(model, position.step)
-            bad = 0 if finite else bad + 1
-            position.step += 1
-            position.seconds = seconds
-            display.step(
-                position.step,
-                seconds,
-                (position.step if recipe.steps else seconds) / scale,
-                {
-                    "loss": loss_sum / ranks.world,
-                    "learning_rate": rate,
-                    "gradient_norm": norm,
-                    "edges_per_second": edges / (time.perf_counter() - began),
-                },
-            )
-            if bad >= PATIENCE:
-                raise TrainingError(
-                    f"the loss was not finite {bad} steps in a row, until step {position.step}; "
-                    f"lower learning_rate ({recipe.learning_rate:g})"
+                # One message carries the gradients and all that the ranks have to agree on.
+                now = clock.read() if ranks.rank == 0 else 0.0
+                facts = torch.tensor([edges, now, float(stop.requested)], device=ranks.device)
+                gradients = [
+                    (torch.zeros_like(p) if p.grad is None else p.grad).flatten()
+                    for p in parameters
+                ]
+                message = ranks.sum(torch.cat([*gradients, loss.detach()[None].float(), facts]))
+                gradient = message[:-4] / ranks.world
+                # The one place in a step where the host waits for a GPU.
+                norm, loss_sum, edges, seconds, stopped = torch.cat(
+                    [gradient.norm()[None], message[-4:]]
+                ).tolist()
+                finite = norm < float("inf")  # False for NaN, too
+                if finite:
+                    gradient *= min(1.0, recipe.clip_norm / (norm + 1e-12))
+                    for p, part in zip(parameters, gradient.split(sizes), strict=True):
+                        p.grad = part.view_as(p)
+                    for group in optimiser.param_groups:
+                        group["lr"] = rate
+                    optimiser.step()
+                    average.update(model, position.step)
+                bad = 0 if finite else bad + 1
+                position.step += 1
+                position.seconds = seconds
+                display.step(
+                    position.step,
+                    seconds,
+                    (position.step if recipe.steps else seconds) / scale,
+                    {
+                        "loss": loss_sum / ranks.world,
+                        "learning_rate": rate,
+                        "gradient_norm": norm,
+                        "edges_per_second": edges / (time.perf_counter() - began),
+                    },
                 )
-            if stopped:
-                interrupted = True
-                break
-            if position.step % TIDY == 0:
-                release_heap()
-            if validator and seconds - position.validated_at >= 60 * recipe.validate_minutes:
+                if bad >= PATIENCE:
+                    raise TrainingError(
+                        f"the loss was not finite {bad} steps in a row, until step "
+                        f"{position.step}; lower learning_rate ({recipe.learning_rate:g})"
+                    )
+                if stopped:
+                    raise Abandoned  # by all ranks, after the same step
+                if position.step % TIDY == 0:
+                    release_heap()
+                due = seconds - position.validated_at >= 60 * recipe.validate_minutes
+                if validator and due and not validate():
+                    raise Abandoned
+                if seconds - position.saved_at >= 60 * recipe.checkpoint_minutes:
+                    save_all()
+            if validator and (position.step > started_at or position.best_score is None):
                 validate()
-            if seconds - position.saved_at >= 60 * recipe.checkpoint_minutes:
-                save_all()
-
-        # -- the end ---------------------------------------------------------------------------
-        if (
-            validator
-            and not interrupted
-            and (position.step > started_at or position.best_score is None)
-        ):
-            validate()
+        except Abandoned:
+            pass
+        except RankError:
+            # The step in progress is lost and all before it are not. A rank that was told to
+            # stop may leave in the middle of a step; any other ends the run.
+            save_all()
+            if not stop.requested:
+                raise
         save_all()
         display.say(
-            f"{'stopped' if stop.is_set() else 'finished'} at step {position.step} after "
+            f"{'stopped' if stop.requested else 'finished'} at step {position.step} after "
             f"{position.seconds / 60:.1f} minutes"
-            + ("; the same command goes on from here" if stop.is_set() else "")
+            + ("; the same command goes on from here" if stop.requested else "")
         )
     return out / ("model" if position.best_score is not None else "last")
+
+
+def _forward_and_backward(
+    run: Run, recipe: Recipe, data: WindowIndex, ranks: Ranks, progress: float
+) -> tuple[Tensor, float]:
+    """Loss of this rank's windows of the next step, with its gradients in the parameters.
+
+    Returns:
+        the loss, a scalar, and the number of edges.
+    """
+    step, config = run.position.step, run.model.config
+    steps = 1
+    if progress >= 1 - recipe.unroll_fraction and recipe.unroll > 1:
+        rng = batches.generator(recipe.seed, batches.UNROLL, step)
+        steps = int(rng.integers(1, recipe.unroll + 1))
+    drawn = batches.draw(
+        data,
+        batches.generator(recipe.seed, batches.DRAW, step),
+        ranks=ranks.world,
+        edges_per_batch=recipe.edges_per_batch,
+        statistics=run.position.statistics,
+        mirror=recipe.mirror,
+        early=recipe.early,
+        early_steps=recipe.early_steps,
+        unroll=steps,
+    )[ranks.rank]
+    batch = batches.collate(
+        [batches.read(data, item, unroll=steps) for item in drawn],
+        noise_std=config.noise_std,
+        rng=batches.generator(recipe.seed, batches.NOISE, step, ranks.rank),
+        device=ranks.device,
+    )
+    autocast = recipe.precision == "bfloat16"
+    with torch.autocast(ranks.device.type, torch.bfloat16) if autocast else nullcontext():
+        loss = unrolled_loss(
+            run.model,
+            batch,
+            steps=steps,
+            backprop=recipe.backprop_through_unroll,
+            linear_beyond=recipe.linear_beyond,
+            momentum_weight=recipe.momentum_weight,
+        )
+    run.optimiser.zero_grad(set_to_none=True)
+    loss.backward()
+    return loss, sum(item.edges for item in drawn)
 
 
 class _Clock:
@@ -268,19 +270,3 @@ class _Clock:
 
     def read(self) -> float:
         return time.monotonic() - self._start
-
-
-@contextmanager
-def _stop_signal() -> Iterator[threading.Event]:
-    """An event that SIGINT and SIGTERM set, while this runs in the main thread."""
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, lambda *_: stop.set()) for number in numbers]
-    try:
-        yield stop
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)

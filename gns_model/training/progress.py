@@ -1,29 +1,30 @@
-"""What a person sees of a training run: a live line, a CSV log and a plot of the loss."""
+"""What a person sees of a training run: a live line, logs and a plot of the loss."""
 
 from __future__ import annotations
 
-import csv
-import io
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 
 from gns_model.console import progress_bar
-from gns_model.scene import write_whole
 from gns_model.training.distributed import Ranks
+from gns_model.training.logs import Events, Table
+from gns_model.training.loss_figure import LOG, VALIDATION, plot
 
 #: Seconds between two rows of the log, and two lines where there is no terminal.
 EVERY = 10.0
 
-LOG, VALIDATION, PLOT = "log.csv", "validation.csv", "loss.png"
+#: Folder of TensorBoard's events.
+EVENTS = "tensorboard"
 
 
 class Display:
     """Progress of a run, on rank 0; silent on the others.
 
     `log.csv` has a row every few seconds (means since the last one), `validation.csv` one for each
-    validation; after a resume, rows beyond the step that is resumed are dropped.
+    validation, and `tensorboard/` both, if TensorBoard is installed; after a resume, what lies
+    beyond the step that is resumed is dropped.
     """
 
     def __init__(self, out: Path, ranks: Ranks, *, step: int, total: float, unit: str) -> None:
@@ -35,13 +36,16 @@ class Display:
         self._bar = progress_bar(quiet=not self.active)
         self._live = self.active and self._bar.console.is_terminal
         if self.active:
-            for name in (LOG, VALIDATION):
-                _keep_until(out / name, step)
+            self._log = Table(out / LOG, step=step)
+            self._checks = Table(out / VALIDATION, step=step)
+            self._events = Events(out / EVENTS, step=step)
 
     def __enter__(self) -> Display:
         if self._live:
             self._bar.start()
             self._task = self._bar.add_task("training", total=self.total)
+        if self.active and not self._events.on:
+            self.say("no TensorBoard logs: pip install 'gns-baffles[train]' adds them to the CSV")
         return self
 
     def __exit__(
@@ -52,6 +56,8 @@ class Display:
     ) -> None:
         if self._live:
             self._bar.stop()
+        if self.active:
+            self._events.close()
 
     def step(self, step: int, seconds: float, done: float, values: Mapping[str, float]) -> None:
         """Take in one optimiser step.
@@ -75,7 +81,8 @@ class Display:
             return
         row = {name: value / self._count for name, value in self._sums.items()}
         row = {"step": step, "seconds": seconds, **row, "steps_per_second": self._count / passed}
-        _append(self.out / LOG, row)
+        self._log.add(row)
+        self._events.add("train", step, {k: v for k, v in row.items() if k != "step"})
         if not self._live:
             left = ""
             if done > self._done:
@@ -91,11 +98,17 @@ class Display:
         self._done = done
         self._sums, self._count, self._since = {}, 0, time.monotonic()
 
+    def validating(self, fraction: float) -> None:
+        """Show how far a validation is, on a terminal."""
+        if self._live:
+            self._bar.update(self._task, description=f"validating {fraction:.0%}")
+
     def validation(self, step: int, seconds: float, values: Mapping[str, float]) -> None:
         """Take in one validation."""
         if not self.active:
             return
-        _append(self.out / VALIDATION, {"step": step, "seconds": seconds, **values})
+        self._checks.add({"step": step, "seconds": seconds, **values})
+        self._events.add("validation", step, values)
         self.say("validation  " + "  ".join(f"{k} {v:.4g}" for k, v in values.items()))
         plot(self.out)
 
@@ -105,82 +118,6 @@ class Display:
             self._bar.console.print(text, highlight=False)
         elif self.active:
             print(text, flush=True)
-
-
-def plot(out: Path) -> None:
-    """Draw `loss.png` from the logs in `out`: training loss, one-step loss and rollout score."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    log, checks = _read(out / LOG), _read(out / VALIDATION)
-    if not log:
-        return
-    figure, (left, right) = pyplot.subplots(1, 2, figsize=(11, 4), layout="constrained")
-    left.plot([r["step"] for r in log], [r["loss"] for r in log], lw=0.8, label="training")
-    if checks:
-        steps = [r["step"] for r in checks]
-        left.plot(steps, [r["one_step"] for r in checks], "o-", label="held out, no noise")
-        for name in dict.fromkeys(name for row in checks for name in row):
-            if name not in ("step", "seconds", "one_step", "slope", "diverged"):
-                style = {"color": "black", "lw": 2} if name == "score" else {"lw": 1}
-                values = [r.get(name, float("nan")) for r in checks]
-                right.plot(steps, values, "o-", label=name, **style)
-        right.set(xlabel="step", ylabel="error relative to truth; score", yscale="log")
-        right.legend()
-    left.set(xlabel="step", ylabel="loss", yscale="log")
-    left.legend()
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=120)
-    pyplot.close(figure)
-    write_whole(out / PLOT, content.getvalue())
-
-
-def _append(path: Path, row: Mapping[str, float]) -> None:
-    """Add one row; the file is written anew if its columns are others."""
-    header = None
-    if path.exists():
-        with path.open(newline="", encoding="utf-8") as file:
-            header = next(csv.reader(file), None)
-    if header != list(row):
-        return _write(path, [*_read(path), dict(row)])
-    with path.open("a", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerow(f"{v:.7g}" for v in row.values())
-
-
-def _write(path: Path, rows: list[dict[str, float]]) -> None:
-    """Write rows whole; a column that a row lacks stays empty in it."""
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    text = io.StringIO(newline="")
-    writer = csv.writer(text)
-    writer.writerow(names)
-    for row in rows:
-        writer.writerow(f"{row[name]:.7g}" if name in row else "" for name in names)
-    write_whole(path, text.getvalue().encode())
-
-
-def _read(path: Path) -> list[dict[str, float]]:
-    """The rows of a log. A last one that was cut short, by a power cut say, is left out."""
-    if not path.exists():
-        return []
-    rows = []
-    with path.open(newline="", encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            try:
-                rows.append({k: float(v) for k, v in row.items() if v != ""})
-            except (TypeError, ValueError):
-                continue
-    return rows
-
-
-def _keep_until(path: Path, step: int) -> None:
-    """Drop the rows beyond `step`, or the file if none is left."""
-    rows = [row for row in _read(path) if row.get("step", step + 1) <= step]
-    if rows:
-        _write(path, rows)
-    else:
-        path.unlink(missing_ok=True)
 
 
 def _clock(seconds: float) -> str:

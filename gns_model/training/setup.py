@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
 
 from gns_model.data.windows import WindowIndex
+from gns_model.learned.config import Limits
+from gns_model.learned.model import LearnedModel
+from gns_model.training.distributed import Ranks
 from gns_model.training.recipe import Recipe, RecipeError
-from gns_model.training.state import Position
+from gns_model.training.schedule import MovingAverage
+from gns_model.training.state import Position, parse_state, restore
+from gns_model.training.statistics import measure
+from gns_model.training.transfer import inherit
 from gns_model.training.validation import Scores
 
 
@@ -51,6 +59,59 @@ def check_resumable(recipe: Recipe, position: Position) -> None:
                 f"cannot resume: {key} = {wanted[key]!r}, but the saved state has "
                 f"{found.get(key)!r}; use another output folder or start anew"
             )
+
+
+@dataclass
+class Run:
+    """What changes from step to step."""
+
+    model: LearnedModel
+    average: MovingAverage
+    optimiser: torch.optim.AdamW
+    position: Position
+
+
+def begin(recipe: Recipe, data: WindowIndex, state_file: Path, ranks: Ranks, resume: bool) -> Run:
+    """A new run, or the one that `state_file` holds, the same on all ranks.
+
+    Rank 0 alone reads the file and measures the data; the others need not see its disk.
+
+    Raises:
+        FileFormatError, RecipeError: as `train`.
+    """
+    torch.manual_seed(recipe.seed)
+    limits = Limits.of(source.scene for source in data.sources)
+    config = recipe.model.model_copy(update={"limits": limits})
+    model = LearnedModel(config).to(ranks.device)
+    average = MovingAverage(model, recipe.ema_decay)
+    optimiser = torch.optim.AdamW(
+        model.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay
+    )
+    there = resume and ranks.rank == 0 and state_file.exists()
+    content = ranks.share(state_file.read_bytes() if there else None)
+    if content:
+        position, tensors = parse_state(content, state_file)
+        check_resumable(recipe, position)
+        restore(tensors, model, average, optimiser, state_file)
+        return Run(model, average, optimiser, position)
+    measured = None
+    if ranks.rank == 0:
+        statistics = measure(
+            data,
+            windows=recipe.statistics_windows,
+            radius=config.radius,
+            noise_std=config.noise_std,
+            subtract_gravity=config.subtract_gravity,
+            seed=recipe.seed,
+        )
+        architecture = recipe.model.model_dump(mode="json")
+        measured = Position(0, 0.0, None, 0.0, 0.0, statistics, architecture, recipe.seed)
+    position = Position.from_json(ranks.share(measured.to_json().encode() if measured else None))
+    position.statistics.apply(model)
+    if recipe.start_from is not None:
+        inherit(model, recipe.start_from)
+    ranks.follow([*model.parameters(), *model.buffers()])
+    return Run(model, MovingAverage(model, recipe.ema_decay), optimiser, position)
 
 
 def card(

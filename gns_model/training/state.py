@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
+from safetensors import SafetensorError
+from safetensors.torch import load, save
 from torch import Tensor
 
 from gns_model.errors import FileFormatError
@@ -53,6 +53,19 @@ class Position:
     seed: int
     ruler: str = ""
 
+    def to_json(self) -> str:
+        """As `from_json` reads it."""
+        return json.dumps(dataclasses.asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str | bytes) -> Position:
+        """Read what `to_json` wrote; KeyError, TypeError or ValueError if it did not."""
+        values = json.loads(text)
+        measured: dict[str, Any] = {
+            k: tuple(v) if isinstance(v, list) else v for k, v in values["statistics"].items()
+        }
+        return cls(**{**values, "statistics": Statistics(**measured)})
+
 
 def save_state(
     path: Path,
@@ -70,7 +83,7 @@ def save_state(
     metadata = {
         "format": FORMAT,
         "version": str(VERSION),
-        "position": json.dumps(dataclasses.asdict(position)),
+        "position": position.to_json(),
     }
     write_whole(path, save(tensors, metadata=metadata))
 
@@ -81,7 +94,7 @@ def read_position(path: Path) -> Position:
     Raises:
         FileFormatError: if the file is truncated, foreign or of a newer version.
     """
-    return _read(path, tensors=False)[0]
+    return parse_state(_content(path), path)[0]
 
 
 def load_state(
@@ -93,7 +106,46 @@ def load_state(
         FileFormatError: if the file is truncated, foreign or of a newer version, or is the state
             of another architecture.
     """
-    position, tensors = _read(path, tensors=True)
+    position, tensors = parse_state(_content(path), path)
+    restore(tensors, model, average, optimiser, path)
+    return position
+
+
+def parse_state(content: bytes, path: Path) -> tuple[Position, dict[str, Tensor]]:
+    """Position and tensors of a state file; `path` is for messages.
+
+    Raises:
+        FileFormatError: if the content is truncated, foreign or of a newer version.
+    """
+    try:
+        tensors = load(content)
+        size = int.from_bytes(content[:8], "little")
+        metadata = json.loads(content[8 : 8 + size]).get("__metadata__", {})
+        if metadata.get("format") != FORMAT:
+            raise FileFormatError(f"{path}: not a {FORMAT} file")
+        if int(metadata["version"]) > VERSION:
+            raise FileFormatError(
+                f"{path}: version {metadata['version']}, this program reads up to {VERSION}"
+            )
+        return Position.from_json(metadata["position"]), tensors
+    except FileFormatError:
+        raise
+    except (SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise FileFormatError(f"{path}: truncated, or not a {FORMAT} file ({error})") from None
+
+
+def restore(
+    tensors: dict[str, Tensor],
+    model: LearnedModel,
+    average: MovingAverage,
+    optimiser: torch.optim.AdamW,
+    path: Path,
+) -> None:
+    """Put the tensors of a state where they belong; `path` is for messages.
+
+    Raises:
+        FileFormatError: if they are of another architecture.
+    """
     parts: dict[str, dict[str, Tensor]] = {"model": {}, "average": {}, "optimiser": {}}
     for key, value in tensors.items():
         part, name = key.split(".", 1)
@@ -110,26 +162,10 @@ def load_state(
         optimiser.load_state_dict({"state": moments, "param_groups": groups})
     except (KeyError, RuntimeError, ValueError):
         raise FileFormatError(f"{path}: the state of a model of another architecture") from None
-    return position
 
 
-def _read(path: Path, *, tensors: bool) -> tuple[Position, dict[str, Tensor]]:
+def _content(path: Path) -> bytes:
     try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            if metadata.get("format") != FORMAT:
-                raise FileFormatError(f"{path}: not a {FORMAT} file")
-            if int(metadata["version"]) > VERSION:
-                raise FileFormatError(
-                    f"{path}: version {metadata['version']}, this program reads up to {VERSION}"
-                )
-            values = json.loads(metadata["position"])
-            content = {k: file.get_tensor(k) for k in file.keys()} if tensors else {}  # noqa: SIM118
-        measured: dict[str, Any] = {
-            k: tuple(v) if isinstance(v, list) else v for k, v in values["statistics"].items()
-        }
-        return Position(**{**values, "statistics": Statistics(**measured)}), content
-    except FileFormatError:
-        raise
-    except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
-        raise FileFormatError(f"{path}: truncated, or not a {FORMAT} file ({error})") from None
+        return path.read_bytes()
+    except OSError as error:
+        raise FileFormatError(f"{path}: cannot be read ({error.strerror})") from None

@@ -91,20 +91,28 @@ class Validator:
         files = [self.index.sources[k].path.name for k in self._chosen]
         return " ".join([*self._names, *files])
 
-    def __call__(self, model: LearnedModel, stop: Callable[[], bool]) -> Scores:
+    def __call__(
+        self,
+        model: LearnedModel,
+        stop: Callable[[], bool],
+        progress: Callable[[float], None] | None = None,
+    ) -> Scores:
         """Score `model`; all ranks must call this together.
 
         Args:
             stop: asked between the steps of a rollout; True ends the validation early.
+            progress: called with the share of this rank's rollouts that is done.
         """
         # A row a rollout: relative errors, then true and predicted leading measure, diverged.
         width = len(self._names)
         table = np.zeros((len(self._chosen) + 1, width + 3))
         simulator = LearnedSimulator(model, "validation")
 
-        def watch(_fraction: float) -> None:
+        def watch(fraction: float) -> None:
             if stop():
                 raise Interrupted
+            if progress is not None:
+                progress((first + fraction * len(batch)) / len(mine))
 
         mine = range(self.ranks.rank, len(self._chosen), self.ranks.world)
         # A GPU wants many scenes at once; on a CPU a batch only makes its steps, which a stop

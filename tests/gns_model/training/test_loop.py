@@ -50,7 +50,7 @@ def test_a_run_leaves_a_simulator_that_runs(tiny, tmp_path, slides):
     names = {p.name for p in (tmp_path / "run").iterdir()}
     assert names == {
         "model", "last", "state.safetensors", "recipe.json",
-        "log.csv", "validation.csv", "loss.png",
+        "log.csv", "validation.csv", "loss.png", "tensorboard",
     }  # fmt: skip
     simulator = load_model(folder)
     card = simulator.card
