@@ -99,8 +99,9 @@ class LearnedSimulator:
             if min(release.size) < self.config.spacing:
                 fill(scene, self.config.spacing)  # raises the error that names the release
         for line in self.config.limits.broken_by(scene):
-            if line not in self._warned:
-                self._warned.add(line)
+            limit = line.split(" = ")[0]  # once for each limit, however many scenes pass it
+            if limit not in self._warned:
+                self._warned.add(limit)
                 warnings.warn(
                     f"scene {scene.name!r} is outside what {self.name} was trained on: {line}",
                     stacklevel=2,
