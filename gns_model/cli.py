@@ -12,6 +12,7 @@ import typer
 
 from gns_model import console
 from gns_model.errors import GnsError
+from gns_model.interop.commands import register as register_interop
 from gns_model.scene import Scene
 from gns_model.suites.command import evaluate
 
@@ -178,12 +179,16 @@ def train(
 
     loaded = Recipe.from_toml(recipe)
     if ranks > 1:
-        launch(recipe, out, ranks, resume=resume)
-    else:
-        print(run(loaded, out, resume=resume))
+        raise typer.Exit(launch(recipe, out, ranks, resume=resume))
+    folder = run(loaded, out, resume=resume)
+    if os.environ.get("RANK", "0") == "0":
+        print(folder)
 
 
 app.command()(evaluate)
+
+
+register_interop(app)
 
 
 def main() -> None:

@@ -9,6 +9,9 @@ File format `gns-trajectory`, version 1 (HDF5; nothing in it is pickled):
     /time            (T,) float64 [s]
     /particle_type   (N,) int8
     /lattice         (N, D) int32, optional: where the point sat in its release
+    /tan_friction    (N,) float32, optional: of every point, where it is not the scene's
+    /                attribute foreign, optional, true: the points came from elsewhere, and are not
+                     those that the scene's releases are filled with
 """
 
 from __future__ import annotations
@@ -48,6 +51,9 @@ class Trajectory:
             repeated, so that positions are finite always.
         settings: spacing, time step, seconds spent and other matters of the simulator.
         lattice: shape (N, D), where each point sat in its release, or None.
+        tan_friction: tan of the friction angle of every point, shape (N,), where it is not the
+            scene's, or None.
+        foreign: the points are not those that the scene's releases are filled with.
     """
 
     positions: np.ndarray
@@ -59,6 +65,8 @@ class Trajectory:
     status: str = OK
     settings: dict[str, Any] = field(default_factory=dict)
     lattice: np.ndarray | None = None
+    tan_friction: np.ndarray | None = None
+    foreign: bool = False
 
     @property
     def point_mass(self) -> float:
@@ -81,6 +89,10 @@ class Trajectory:
             file["particle_type"] = np.asarray(self.particle_type, dtype=np.int8)
             if self.lattice is not None:
                 file["lattice"] = np.asarray(self.lattice, dtype=np.int32)
+            if self.tan_friction is not None:
+                file["tan_friction"] = np.asarray(self.tan_friction, dtype=np.float32)
+            if self.foreign:
+                file.attrs["foreign"] = True
             file.attrs.update(
                 format=FORMAT,
                 version=VERSION,
@@ -112,6 +124,8 @@ class Trajectory:
                     status=_read(file, "status", str),
                     settings=_json(file, "settings"),
                     lattice=file["lattice"][()] if "lattice" in file else None,
+                    tan_friction=file["tan_friction"][()] if "tan_friction" in file else None,
+                    foreign=bool(file.attrs.get("foreign", False)),
                 )
             except _DAMAGE as error:
                 raise FileFormatError(f"{path}: damaged or foreign ({_line(error)})") from None

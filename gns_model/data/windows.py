@@ -9,26 +9,34 @@ the whole does; that is what training draws.
 
 A window may begin at the first frame: history before t = 0 is the release velocity extended
 backwards, exactly as a rollout of the learned simulator begins.
+
+Imported trajectories are foreign: their points are no lattice of a release, so all of them are
+used, at the spacing that they have, and nothing is known of the time before the first frame.
+Their stationary points are rows like all others.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import h5py
 import numpy as np
 
 from gns_model.errors import FileFormatError, SceneError
-from gns_model.particles import MOVING, fill
+from gns_model.particles import MOVING, STATIONARY, fill
 from gns_model.scene import Scene
 from gns_model.trajectory import OK, open_trajectory
 
 #: How far a ratio of spacings or intervals may lie from an integer.
 INTEGER_TOLERANCE = 0.01
+
+#: How far the spacing of foreign points, which is an estimate, may lie from the model's.
+FOREIGN_TOLERANCE = 0.15
 
 
 @dataclass(frozen=True)
@@ -39,11 +47,24 @@ class Window:
         history: positions [m], oldest first, one `dt` apart, shape (N, H+1, D) float32.
         future: the true positions [m] of the next K steps, shape (N, K, D) float32.
         scene: what flows, and around what.
+        particle_type: shape (N,) int64; 3 is a kinematic point, others move. Default: all move.
+        tan_friction: tan of the friction angle of every point, shape (N,) float32. Default: the
+            scene's.
     """
 
     history: np.ndarray
     future: np.ndarray
     scene: Scene
+    particle_type: np.ndarray = field(default=None)  # type: ignore[arg-type]
+    tan_friction: np.ndarray = field(default=None)  # type: ignore[arg-type]
+
+    def __post_init__(self) -> None:
+        points = len(self.history)
+        if self.particle_type is None:
+            object.__setattr__(self, "particle_type", np.full(points, MOVING, np.int64))
+        if self.tan_friction is None:
+            tangent = math.tan(math.radians(self.scene.material.friction_angle))
+            object.__setattr__(self, "tan_friction", np.full(points, tangent, np.float32))
 
 
 @dataclass(frozen=True)
@@ -57,6 +78,9 @@ class Source:
     residue: np.ndarray  #: tracer set of every point, shape (N,) uint8
     cell: np.ndarray  #: cell of the model that every point starts in, shape (N,) int32
     counts: tuple[int, ...]  #: points of every release, in order
+    foreign: bool = False  #: imported: its points are not those of its scene
+    particle_type: np.ndarray | None = None  #: of foreign points, shape (N,) int8
+    tan_friction: np.ndarray | None = None  #: of foreign points, shape (N,), if it is known
 
     def points(self, residue: int) -> int:
         """Number of points in a tracer set."""
@@ -122,12 +146,12 @@ class WindowIndex:
         if len(dims) > 1:
             raise FileFormatError(f"{folders[0]}: 2D and 3D trajectories cannot train one model")
         self.dim = dims.pop()
-        last = self.unroll * max(self._stride(s) for s in self.sources)
-        for source in self.sources:
-            if source.frames <= last:
+        for k, source in enumerate(self.sources):
+            if self.starts(k) < 1:
+                needed = source.frames + 1 - self.starts(k)
                 raise FileFormatError(
                     f"{source.path}: {source.frames} frames are too few, {unroll} steps of "
-                    f"{dt:g} s need {last + 1}"
+                    f"{dt:g} s need {needed}"
                 )
 
     def _stride(self, source: Source) -> int:
@@ -144,7 +168,13 @@ class WindowIndex:
     def starts(self, source: int, unroll: int | None = None) -> int:
         """Number of frames in a file at which a window of `unroll` future steps can begin."""
         steps = self.unroll if unroll is None else unroll
-        return self.sources[source].frames - steps * self._stride(self.sources[source])
+        entry = self.sources[source]
+        return entry.frames - self.first(source) - steps * self._stride(entry)
+
+    def first(self, source: int) -> int:
+        """The frame of a file that counts as frame 0: a foreign one needs a whole history first."""
+        entry = self.sources[source]
+        return self.history * self._stride(entry) if entry.foreign else 0
 
     def read(
         self,
@@ -159,7 +189,7 @@ class WindowIndex:
 
         Args:
             source: which file, 0 to len(sources) - 1.
-            frame: the current frame, 0 to `starts(source) - 1`.
+            frame: the current frame, 0 to `starts(source) - 1`, counted from `first(source)`.
             residue: which tracer set, 0 to `residues(source) - 1`.
             mixture: seed of a mixture of the tracer sets, in place of one of them.
             unroll: number of future steps if it is not the index's.
@@ -176,7 +206,7 @@ class WindowIndex:
             chosen = np.flatnonzero(entry.residue == residue)
         else:
             chosen = entry.mixture(mixture)
-        frames = frame + stride * np.arange(-self.history, steps + 1)
+        frames = self.first(source) + frame + stride * np.arange(-self.history, steps + 1)
         out = np.empty((len(chosen), len(frames), self.dim), dtype=np.float32)
         try:
             with open_trajectory(entry.path) as file:
@@ -193,7 +223,14 @@ class WindowIndex:
                 raise
             raise FileFormatError(f"{entry.path}: unreadable at frame {frame} ({error})") from None
         split = self.history + 1
-        return Window(out[:, :split], out[:, split:], entry.scene)
+        kinds, friction = entry.particle_type, entry.tan_friction
+        return Window(
+            out[:, :split],
+            out[:, split:],
+            entry.scene,
+            particle_type=None if kinds is None else kinds[chosen].astype(np.int64),  # type: ignore[arg-type]
+            tan_friction=None if friction is None else friction[chosen],  # type: ignore[arg-type]
+        )
 
 
 def read_source(path: Path, *, spacing: float) -> Source | None:
@@ -212,6 +249,8 @@ def read_source(path: Path, *, spacing: float) -> Source | None:
             lattice = file["lattice"][()] if "lattice" in file else None
             kinds = file["particle_type"][()]
             volume = float(file.attrs["point_volume"])
+            foreign = bool(file.attrs.get("foreign", False))
+            friction = file["tan_friction"][()] if "tan_friction" in file else None
         except (KeyError, OSError, TypeError) as error:
             raise FileFormatError(f"{path}: truncated or foreign ({error})") from None
     if len(shape) != 3 or shape[2] != scene.dim or volume <= 0:
@@ -219,9 +258,23 @@ def read_source(path: Path, *, spacing: float) -> Source | None:
     intervals = np.diff(time)
     if len(intervals) == 0 or intervals[0] <= 0 or np.ptp(intervals) > 1e-3 * intervals[0]:
         raise FileFormatError(f"{path}: its frames are not evenly spaced in time")
+    file_spacing = volume ** (1 / scene.dim)
+    if foreign:
+        _check_foreign(path, kinds, friction, file_spacing, spacing)
+        return Source(
+            path=path,
+            scene=scene,
+            frames=shape[0],
+            interval=float(intervals.mean()),
+            residue=np.zeros(shape[1], np.uint8),
+            cell=np.arange(shape[1], dtype=np.int32),
+            counts=(shape[1],),
+            foreign=True,
+            particle_type=kinds,
+            tan_friction=friction,
+        )
     if (kinds != MOVING).any():
         raise FileFormatError(f"{path}: holds points that do not move; none can be trained on")
-    file_spacing = volume ** (1 / scene.dim)
     try:
         points = fill(scene, file_spacing)
     except SceneError as error:
@@ -255,6 +308,18 @@ def read_source(path: Path, *, spacing: float) -> Source | None:
         cell=cell.astype(np.int32),
         counts=counts,
     )
+
+
+def _check_foreign(
+    path: Path, kinds: np.ndarray, friction: np.ndarray | None, has: float, wanted: float
+) -> None:
+    if (kinds == STATIONARY).all() or (friction is not None and friction.shape != kinds.shape):
+        raise FileFormatError(f"{path}: particle_type and tan_friction do not fit a moving mass")
+    if abs(has / wanted - 1) > FOREIGN_TOLERANCE:
+        raise FileFormatError(
+            f"{path}: imported points are about {has:.3g} m apart, and the model's {wanted:g} m: "
+            "foreign points cannot be thinned out, so the model has to take their spacing"
+        )
 
 
 def _scene_of(file: h5py.File, path: Path) -> Scene:
