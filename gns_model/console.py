@@ -72,7 +72,7 @@ def main(app: Typer, name: str, arguments: list[str] | None = None) -> NoReturn:
             if not hasattr(error, "format_message"):
                 raise
             message = error.format_message()
-            if "\n" in message.strip():  # no command given: typer's message is the whole help
+            if type(error).__name__ == "NoArgsIsHelpError":  # the message is the whole help
                 print(message, file=sys.stderr)
                 raise SystemExit(USER_ERROR) from None
             fail(f"{message} (see {name} --help)")

@@ -1,8 +1,8 @@
 """Arrays out of an npz of object arrays, whose pickles are read without running anything.
 
 NumPy stores an object array as a pickle, and loading a pickle can call whatever it names. Here it
-can name five functions of NumPy's own, the ones that rebuild arrays, and gets stand-ins for these:
-they note what they were asked for, check it, and only then is an array made, from plain bytes.
+can name the few functions by which NumPy rebuilds arrays and gets stand-ins for these: they note
+what they were asked for, check it, and only then is an array made, from plain bytes.
 Python's own unpickler is used, not the one in C, because a hostile file could crash the latter.
 """
 
@@ -182,6 +182,20 @@ def _from_buffer(raw: Any, dtype: Any, shape: Any, order: Any, axes: Any = None)
     return array
 
 
+def _latin(text: Any, encoding: Any) -> bytes:
+    """How protocol 2 writes bytes."""
+    if type(text) is not str or encoding != "latin1":
+        raise Refused("bytes in it are malformed")
+    return text.encode("latin1")
+
+
+def _empty(*arguments: Any) -> bytes:
+    """How protocol 2 writes no bytes."""
+    if arguments:
+        raise Refused("bytes in it are malformed")
+    return b""
+
+
 def _nothing(*_arguments: Any) -> Any:
     raise Refused("it calls numpy.ndarray")
 
@@ -190,6 +204,9 @@ def _nothing(*_arguments: Any) -> Any:
 ALLOWED = {
     ("numpy", "dtype"): _Dtype,
     ("numpy", "ndarray"): _nothing,  # only ever an argument
+    ("_codecs", "encode"): _latin,
+    ("builtins", "bytes"): _empty,
+    ("__builtin__", "bytes"): _empty,
     **{
         (f"numpy.{core}.{module}", name): call
         for core in ("core", "_core")

@@ -115,11 +115,18 @@ def import_dataset(
 
 
 def count_dataset(path: str | os.PathLike[str]) -> int:
-    """Number of trajectories in a file; for an npz with one key for all, 1."""
-    if _is_hdf5(path):
+    """Number of trajectories in a file; for an npz with one key for all, 1.
+
+    Raises:
+        FileFormatError: if it is missing, truncated or foreign.
+    """
+    if not _is_hdf5(path):
+        return count_npz(path)
+    try:
         with h5py.File(path, "r") as file:
             return len(file)
-    return count_npz(path)
+    except (OSError, RuntimeError):
+        raise FileFormatError(f"{path}: truncated, or not HDF5") from None
 
 
 def read_dataset(path: str | os.PathLike[str]) -> Iterator[ForeignTrajectory]:

@@ -19,6 +19,7 @@ import hashlib
 import math
 import os
 import re
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -135,7 +136,9 @@ def read_state(path: str | os.PathLike[str]) -> State:
     if not Path(path).is_file():
         raise FileFormatError(f"{path}: no such file")
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of torch, on what is about to be refused
+            content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged file raises nearly anything
         what = re.search(r"Unsupported global: GLOBAL (\S+)", str(error))
         reason = f"it wants {what[1]}, which is no tensor" if what else "truncated or foreign"
