@@ -5,6 +5,7 @@ Alone it trains in one process; under `torchrun` or `launch` it is one of severa
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -25,7 +26,8 @@ def run(
 ) -> None:
     """Train a learned simulator."""
     path = train(Recipe.from_toml(recipe), out, resume=resume)
-    print(path)
+    if os.environ.get("RANK", "0") == "0":
+        print(path)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ of the sampler is the number of the step, and a resumed run draws what it would 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,7 +15,9 @@ from torch import Tensor
 
 from gns_model.data.windows import Window, WindowIndex
 from gns_model.learned.world import World
+from gns_model.particles import STATIONARY
 from gns_model.training.augment import mirror_positions, mirrored
+from gns_model.training.kinematic import with_baffle_points
 from gns_model.training.noise import random_walk
 from gns_model.training.statistics import Statistics
 
@@ -42,11 +44,13 @@ class Batch:
         history: noisy positions [m], oldest first, shape (N, H+1, D).
         moves: true displacement of each coming step [m], shape (N, K, D).
         world: what surrounds the points.
+        moving: mask of the points that the loss is about, shape (N,); None: all.
     """
 
     history: Tensor
     moves: Tensor
     world: World
+    moving: Tensor | None = None
 
 
 def generator(seed: int, purpose: int, step: int, rank: int = 0) -> np.random.Generator:
@@ -99,16 +103,24 @@ def draw(
     return parts
 
 
-def read(index: WindowIndex, item: Draw, *, unroll: int = 1) -> Window:
-    """Read what was drawn, mirrored if so drawn."""
+def read(
+    index: WindowIndex, item: Draw, *, unroll: int = 1, kinematic: float | None = None
+) -> Window:
+    """Read what was drawn, mirrored if so drawn.
+
+    Args:
+        unroll: number of future steps.
+        kinematic: see `kinematic.kinematic_spacing`.
+    """
     window = index.read(item.source, item.frame, mixture=item.mixture, unroll=unroll)
-    if not item.mirror:
-        return window
-    return Window(
-        mirror_positions(window.history, window.scene),
-        mirror_positions(window.future, window.scene),
-        mirrored(window.scene),
-    )
+    if item.mirror:
+        window = replace(
+            window,
+            history=mirror_positions(window.history, window.scene),
+            future=mirror_positions(window.future, window.scene),
+            scene=mirrored(window.scene),
+        )
+    return window if kinematic is None else with_baffle_points(window, kinematic)
 
 
 def collate(
@@ -118,18 +130,31 @@ def collate(
     rng: np.random.Generator,
     device: torch.device,
 ) -> Batch:
-    """Lay windows side by side and add random-walk noise to the history.
+    """Lay windows side by side and add random-walk noise to the history of what moves.
 
     The true displacements are taken between true positions, so that adding one to a noisy position
     corrects the target for the noise: a step that reproduces it ends with the true velocity.
     """
     history = np.concatenate([w.history for w in windows])
     future = np.concatenate([w.future for w in windows])
+    kinds = np.concatenate([w.particle_type for w in windows])
+    friction = np.concatenate([w.tan_friction for w in windows])
     moves = np.diff(future, axis=1, prepend=history[:, -1:])
+    moving = kinds != STATIONARY
     if noise_std > 0:
         points, frames, dim = history.shape
-        history = history + random_walk(rng, points, frames - 1, dim, noise_std)
+        noise = random_walk(rng, points, frames - 1, dim, noise_std)
+        history = history + noise * moving[:, None, None]
     world = World.from_scenes(
-        [w.scene for w in windows], [len(w.history) for w in windows], device=device
+        [w.scene for w in windows],
+        [len(w.history) for w in windows],
+        device=device,
+        particle_type=torch.from_numpy(kinds).to(device),
+        tan_friction=torch.from_numpy(friction).to(device),
     )
-    return Batch(torch.from_numpy(history).to(device), torch.from_numpy(moves).to(device), world)
+    return Batch(
+        torch.from_numpy(history).to(device),
+        torch.from_numpy(moves).to(device),
+        world,
+        None if moving.all() else torch.from_numpy(moving).to(device),
+    )

@@ -45,12 +45,14 @@ def claim(out: Path, stop: Stop) -> Iterator[None]:
             if time.monotonic() > deadline:
                 raise TrainingError(f"{out}: another run trains in this folder")
             time.sleep(0.2)
-        yield
+        try:
+            yield
+        finally:
+            with contextlib.suppress(OSError):
+                out.rmdir()  # only if nothing came of it
     finally:
         if folder is not None:
             os.close(folder)
-        with contextlib.suppress(OSError):
-            out.rmdir()  # only if nothing came of it
 
 
 def _locked(folder: int) -> bool:

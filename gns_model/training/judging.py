@@ -7,7 +7,7 @@ stand against and is read by the paper's runout, its farthest point. Both by the
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -63,12 +63,8 @@ class Facts:
 
         Velocities are differences between frames, so that energies compare at equal intervals.
         """
-        kept = Trajectory(
-            positions=trajectory.positions[::stride],
-            time=trajectory.time[::stride],
-            particle_type=trajectory.particle_type,
-            scene=trajectory.scene,
-            point_volume=trajectory.point_volume,
+        kept = replace(
+            trajectory, positions=trajectory.positions[::stride], time=trajectory.time[::stride]
         )
         mass = trajectory.point_mass * measures.moving_positions(kept).shape[1]
         energies = [measures.potential_energy(kept), measures.kinetic_energy(kept)]

@@ -18,6 +18,7 @@ from gns_model.training import batches
 from gns_model.training.claim import TrainingError, claim, tidy
 from gns_model.training.distributed import RankError, Ranks, session
 from gns_model.training.heap import release_heap
+from gns_model.training.kinematic import kinematic_spacing
 from gns_model.training.launching import end_with_launcher
 from gns_model.training.loss import unrolled_loss
 from gns_model.training.progress import Display
@@ -241,8 +242,9 @@ def _forward_and_backward(
         early_steps=recipe.early_steps,
         unroll=steps,
     )[ranks.rank]
+    kinematic = kinematic_spacing(config)
     batch = batches.collate(
-        [batches.read(data, item, unroll=steps) for item in drawn],
+        [batches.read(data, item, unroll=steps, kinematic=kinematic) for item in drawn],
         noise_std=config.noise_std,
         rng=batches.generator(recipe.seed, batches.NOISE, step, ranks.rank),
         device=ranks.device,

@@ -20,6 +20,7 @@ def step_error(
     move: Tensor,
     *,
     batch: Tensor | None = None,
+    moving: Tensor | None = None,
     linear_beyond: float | None = None,
     momentum_weight: float = 0.0,
 ) -> Tensor:
@@ -37,10 +38,14 @@ def step_error(
             (pseudo-Huber, 2 d² (sqrt(1 + e²/d²) - 1)); default: nowhere. Impacts are rare and
             large: a thousandth of the points holds a quarter of the squares.
         batch: scene of every point, shape (N,); default: all in one.
+        moving: mask of the points that count, shape (N,); default: all.
         momentum_weight: of the mean over scenes of the square of a scene's mean error. An error
             that all points share moves the centroid and hardly shows in the mean of squares.
     """
     error = (after - history[:, -1]) - move
+    if moving is not None:
+        error = error[moving]
+        batch = None if batch is None else batch[moving]
     error = error / (model.config.dt**2 * model.acceleration_std)
     square = error.square()
     if linear_beyond is not None:
@@ -81,6 +86,7 @@ def unrolled_loss(
             after,
             batch.moves[:, k],
             batch=batch.world.batch,
+            moving=batch.moving,
             linear_beyond=linear_beyond,
             momentum_weight=momentum_weight,
         )

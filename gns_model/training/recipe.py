@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from gns_model.errors import GnsError
 from gns_model.learned.config import ModelConfig
+from gns_model.particles import MOVING
 from gns_model.scene import first_fault
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -82,10 +83,10 @@ class Recipe(BaseModel):
     def _consistent(self) -> Recipe:
         if (self.steps is None) == (self.minutes is None):
             raise ValueError("give either steps or minutes, one of the two")
-        if self.model.baffles == "points":
-            raise ValueError('model.baffles = "points" is for imported weights, not for training')
-        if self.model.types:
-            raise ValueError("model.types = 0 is the only choice for training: all points move")
+        if 0 < self.model.types <= MOVING:
+            raise ValueError(
+                f"model.types must be 0 or at least {MOVING + 1}; moving points have type {MOVING}"
+            )
         return self
 
     @classmethod

@@ -7,12 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
-from gns_model.data.windows import WindowIndex
-from gns_model.learned.config import Limits
+from gns_model.data.windows import Source, WindowIndex
+from gns_model.learned.config import Limits, ModelConfig
 from gns_model.learned.model import LearnedModel
+from gns_model.particles import MOVING, STATIONARY
 from gns_model.training.distributed import Ranks
+from gns_model.training.kinematic import kinematic_spacing
 from gns_model.training.recipe import Recipe, RecipeError
 from gns_model.training.schedule import MovingAverage
 from gns_model.training.state import Position, parse_state, restore
@@ -38,7 +41,30 @@ def open_data(recipe: Recipe, folders: tuple[str, ...]) -> WindowIndex:
         raise RecipeError(
             f"{folders[0]}: {index.dim}D trajectories, but model.dim = {recipe.model.dim}"
         )
+    for source in index.sources:
+        _check_fits(recipe.model, source)
     return index
+
+
+def _check_fits(model: ModelConfig, source: Source) -> None:
+    """Refuse data that holds what the model cannot see.
+
+    Raises:
+        RecipeError: naming the file and the key.
+    """
+    kinds = np.array([MOVING]) if source.particle_type is None else source.particle_type
+    if model.types and kinds.max() >= model.types:
+        raise RecipeError(
+            f"{source.path}: particle type {kinds.max()}, but model.types = {model.types} embeds "
+            f"0 to {model.types - 1}"
+        )
+    if model.baffles == "distance" and (kinds == STATIONARY).any():
+        raise RecipeError(
+            f'{source.path}: holds kinematic points, but model.baffles = "distance" sees boxes; '
+            'use "points"'
+        )
+    if model.baffles == "none" and source.scene.baffles:
+        raise RecipeError(f'{source.path}: has baffles, but model.baffles = "none" sees none')
 
 
 #: What of a model's configuration the weights do not depend on: it may change on the way.
@@ -102,6 +128,7 @@ def begin(recipe: Recipe, data: WindowIndex, state_file: Path, ranks: Ranks, res
             radius=config.radius,
             noise_std=config.noise_std,
             subtract_gravity=config.subtract_gravity,
+            kinematic=kinematic_spacing(config),
             seed=recipe.seed,
         )
         architecture = recipe.model.model_dump(mode="json")

@@ -10,7 +10,9 @@ import torch
 from gns_model.data.windows import WindowIndex
 from gns_model.learned.graph import radius_graph
 from gns_model.learned.model import LearnedModel
+from gns_model.particles import STATIONARY
 from gns_model.training.augment import mirror_axis
+from gns_model.training.kinematic import with_baffle_points
 
 #: Bins of time, from release to rest, in which the number of neighbours is averaged.
 TIME_BINS = 8
@@ -27,7 +29,8 @@ class Statistics:
             axis is zero by symmetry; where gravity is subtracted, the acceleration is a - g.
         velocity_std, acceleration_std: root mean square over the axes [m/s], [m/s²], noise of the
             training included.
-        neighbours: mean number of edges of a point in each of TIME_BINS bins of time.
+        neighbours: mean number of edges for each point of a file, those of kinematic points that
+            join it included, in each of TIME_BINS bins of time.
     """
 
     velocity_mean: tuple[float, ...]
@@ -63,6 +66,7 @@ def measure(
     radius: float,
     noise_std: float,
     subtract_gravity: bool,
+    kinematic: float | None = None,
     seed: int = 0,
 ) -> Statistics:
     """Stream over random windows, one in memory at a time.
@@ -73,6 +77,7 @@ def measure(
         noise_std: of the training [m]. It adds noise_std / dt to the deviation of the last
             velocity and noise_std / dt² to that of the acceleration, in squares.
         subtract_gravity: whether the network predicts a - g.
+        kinematic: see `kinematic_spacing`; what stands still adds edges and nothing else.
         seed: of the choice of windows.
     """
     rng = np.random.default_rng([seed, 0x57A7])
@@ -87,18 +92,25 @@ def measure(
         frame = min(starts - 1, int(when * starts))
         mixture = int(rng.integers(2**31))
         window = index.read(source, frame, mixture=mixture, unroll=1)
-        now, before = window.history[:, -1].astype(float), window.history[:, -2].astype(float)
+        rows = len(window.history)
+        moving = window.particle_type != STATIONARY
+        now, before, after = (
+            positions[moving].astype(float)
+            for positions in (window.history[:, -1], window.history[:, -2], window.future[:, 0])
+        )
         velocity = (now - before) / index.dt
-        acceleration = ((window.future[:, 0] - now) / index.dt - velocity) / index.dt
+        acceleration = ((after - now) / index.dt - velocity) / index.dt
         if subtract_gravity:
             acceleration -= np.asarray(window.scene.gravity)
         count += len(now)
         for row, values in enumerate((velocity, velocity**2, acceleration, acceleration**2)):
             sums[row] += values.sum(axis=0)
         if k < 8 * TIME_BINS:
+            if kinematic is not None:
+                window = with_baffle_points(window, kinematic)
             senders, _ = radius_graph(torch.from_numpy(window.history[:, -1].copy()), radius)
             edges[time_bin(when)] += len(senders)
-            points[time_bin(when)] += len(now)
+            points[time_bin(when)] += rows
     means = sums / max(1, count)
     axis = mirror_axis(index.dim)
     means[0, axis] = means[2, axis] = 0.0

@@ -6,8 +6,8 @@ would read off its rollouts. The ranks share the rollouts, so that none waits fo
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -16,10 +16,12 @@ from gns_model import measures
 from gns_model.data.windows import WindowIndex
 from gns_model.learned.model import LearnedModel
 from gns_model.learned.simulator import LearnedSimulator
-from gns_model.scene import Scene
+from gns_model.particles import MOVING, STATIONARY
+from gns_model.simulator import Progress
 from gns_model.training.batches import Draw, collate, read
 from gns_model.training.distributed import Ranks
 from gns_model.training.judging import AIMS, Facts, errors, judged_by, judged_by_all
+from gns_model.training.kinematic import kinematic_spacing
 from gns_model.training.loss import unrolled_loss
 from gns_model.trajectory import OK, Trajectory
 
@@ -121,8 +123,7 @@ class Validator:
         try:
             for first in range(0, len(mine), max(1, together)):
                 batch = mine[first : first + together]
-                results = simulator.rollout([self._scene(row) for row in batch], progress=watch)
-                for row, result in zip(batch, results, strict=True):
+                for row, result in zip(batch, self._simulate(simulator, batch, watch), strict=True):
                     table[row] = self._compare(row, result)
             table[-1, :2] = self._one_step(simulator.model, stop)
         except Interrupted:
@@ -143,17 +144,45 @@ class Validator:
             complete=interrupted == 0,
         )
 
-    def _scene(self, row: int) -> Scene:
-        """The scene for as long as the reference simulated it."""
-        entry = self.index.sources[self._chosen[row]]
-        return entry.scene.replace(duration=(entry.frames - 1) * entry.interval)
+    def _simulate(
+        self, simulator: LearnedSimulator, rows: Sequence[int], watch: Progress
+    ) -> list[Trajectory]:
+        """Rollouts of some of the chosen files, for as long as the reference simulated them.
+
+        A foreign one goes on from its own first frames: its points fill no scene.
+        """
+        sources = [self.index.sources[self._chosen[row]] for row in rows]
+        if not any(source.foreign for source in sources):
+            scenes = [s.scene.replace(duration=(s.frames - 1) * s.interval) for s in sources]
+            return simulator.rollout(scenes, progress=watch)
+        results = []
+        for row, source in zip(rows, sources, strict=True):
+            if not source.foreign:
+                results += self._simulate(simulator, [row], watch)
+                continue
+            k = self._chosen[row]
+            start = self.index.read(k, 0, unroll=1)
+            frames = 1 + (source.frames - 1 - self.index.first(k)) // self.index.stride(k)
+            result = simulator.rollout_from(
+                source.scene,
+                start.history,
+                start.particle_type,
+                start.tan_friction,
+                frames=frames,
+                progress=watch,
+            )
+            results.append(_all_moving_alike(result))
+        return results
 
     def _facts(self, row: int) -> Facts:
-        source = self._chosen[row]
-        if source not in self._truth:
-            trajectory = Trajectory.load(self.index.sources[source].path)
-            self._truth[source] = Facts.of(trajectory, self.index.stride(source))
-        return self._truth[source]
+        k = self._chosen[row]
+        if k not in self._truth:
+            truth = Trajectory.load(self.index.sources[k].path)
+            first = self.index.first(k)
+            if first:
+                truth = replace(truth, positions=truth.positions[first:], time=truth.time[first:])
+            self._truth[k] = Facts.of(_all_moving_alike(truth), self.index.stride(k))
+        return self._truth[k]
 
     def _compare(self, row: int, result: Trajectory) -> list[float]:
         """One row of the table; measures that mean nothing in the scene count 0 and are left out
@@ -180,11 +209,19 @@ class Validator:
                 continue
             if stop():
                 raise Interrupted
-            window = read(self.index, Draw(source, frame, 0, False, 0.0), unroll=1)
+            item = Draw(source, frame, 0, False, 0.0)
+            window = read(self.index, item, kinematic=kinematic_spacing(model.config))
             batch = collate([window], noise_std=0.0, rng=rng, device=self.ranks.device)
             total += float(unrolled_loss(model, batch))
             number += 1
         return total, float(number)
+
+
+def _all_moving_alike(trajectory: Trajectory) -> Trajectory:
+    """Foreign points move under several types; measures are about those of one."""
+    kinds = trajectory.particle_type
+    alike = np.where(kinds == STATIONARY, kinds, MOVING).astype(kinds.dtype)
+    return replace(trajectory, particle_type=alike)
 
 
 def _slope(true: np.ndarray, found: np.ndarray) -> float:

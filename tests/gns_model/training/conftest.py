@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from safetensors.torch import load_file
 
 from gns_model.particles import MOVING, fill
 from gns_model.scene import Scene
@@ -106,3 +109,29 @@ def tiny(slides: Path) -> dict[str, Any]:
         "device": "cpu",
         "model": {"spacing": 0.0625, "dt": 0.02, "radius": 0.1, "latent": 8, "blocks": 2},
     }
+
+
+@pytest.fixture(scope="session")
+def write_recipe() -> Callable[[Path, dict[str, Any]], Path]:
+    """A function that writes a recipe, given as plain values, to a file."""
+
+    def write(path: Path, values: dict[str, Any]) -> Path:
+        lines = [f"{k} = {json.dumps(v)}" for k, v in values.items() if k != "model"]
+        lines += ["[model]", *(f"{k} = {json.dumps(v)}" for k, v in values["model"].items())]
+        path.write_text("\n".join(lines))
+        return path
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def same_state() -> Callable[[Path, Path], bool]:
+    """A function: whether weights, moving average and moments of two runs agree bit for bit."""
+
+    def same(a: Path, b: Path) -> bool:
+        one, two = load_file(a / "state.safetensors"), load_file(b / "state.safetensors")
+        assert one.keys() == two.keys()
+        assert any(key.startswith("optimiser.") for key in one)
+        return all(torch.equal(one[key], two[key]) for key in one)
+
+    return same

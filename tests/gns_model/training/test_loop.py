@@ -8,7 +8,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,7 @@ import torch
 from safetensors.torch import load_file
 
 from gns_model.learned.checkpoint import load_model
-from gns_model.training import Recipe, RecipeError, TrainingError, launch, train
+from gns_model.training import Recipe, RecipeError, TrainingError, train
 from gns_model.training.progress import Display
 from gns_model.training.state import read_position
 from gns_model.trajectory import Trajectory
@@ -24,24 +23,9 @@ from gns_model.trajectory import Trajectory
 ROOT = Path(__file__).parents[3]
 
 
-def write_recipe(path: Path, values: dict) -> Path:
-    lines = [f"{k} = {json.dumps(v)}" for k, v in values.items() if k != "model"]
-    lines += ["[model]", *(f"{k} = {json.dumps(v)}" for k, v in values["model"].items())]
-    path.write_text("\n".join(lines))
-    return path
-
-
 def validations(out: Path) -> list[dict[str, float]]:
     with (out / "validation.csv").open() as file:
         return [{k: float(v) for k, v in row.items()} for row in csv.DictReader(file)]
-
-
-def same_state(a: Path, b: Path) -> bool:
-    """Whether weights, moving average and moments agree bit for bit."""
-    one, two = load_file(a / "state.safetensors"), load_file(b / "state.safetensors")
-    assert one.keys() == two.keys()
-    assert any(key.startswith("optimiser.") for key in one)
-    return all(torch.equal(one[key], two[key]) for key in one)
 
 
 def test_a_run_leaves_a_simulator_that_runs(tiny, tmp_path, slides):
@@ -92,7 +76,7 @@ def test_the_best_model_is_kept(tiny, tmp_path):
     assert card["trained_on"]["steps"] == best["step"]
 
 
-def test_resume_is_bit_exact_after_a_signal(tiny, tmp_path, monkeypatch):
+def test_resume_is_bit_exact_after_a_signal(tiny, tmp_path, monkeypatch, same_state):
     """Six steps at once, and three, SIGTERM, three: the same weights, average and moments."""
     recipe = Recipe.from_dict(tiny)
     train(recipe, tmp_path / "whole")
@@ -115,7 +99,7 @@ def test_resume_is_bit_exact_after_a_signal(tiny, tmp_path, monkeypatch):
     assert same_state(tmp_path / "whole", tmp_path / "parts")
 
 
-def test_starting_anew_forgets_the_state(tiny, tmp_path):
+def test_starting_anew_forgets_the_state(tiny, tmp_path, same_state):
     recipe = Recipe.from_dict({**tiny, "valid": []})
     assert train(recipe, tmp_path / "a") == tmp_path / "a" / "last"
     train(recipe, tmp_path / "b")
@@ -165,41 +149,6 @@ def test_other_ways_to_train_run(tiny, tmp_path, options):
     train(recipe, tmp_path)
     with (tmp_path / "log.csv").open() as file:
         assert all(float(row["loss"]) < 20 for row in csv.DictReader(file))
-
-
-@pytest.mark.slow
-def test_two_ranks_resume_bit_exactly_and_average_their_gradients(tiny, tmp_path):
-    values = {**tiny, "schedule": "exponential", "unroll_fraction": 0.0, "valid": []}
-    whole = write_recipe(tmp_path / "whole.toml", values)
-    half = write_recipe(tmp_path / "half.toml", {**values, "steps": 3})
-    assert launch(whole, tmp_path / "whole", 2) == 0
-    assert launch(half, tmp_path / "parts", 2) == 0
-    assert launch(whole, tmp_path / "parts", 2) == 0
-    assert same_state(tmp_path / "whole", tmp_path / "parts")
-    # One rank sees other batches and so ends elsewhere.
-    train(Recipe.from_toml(whole), tmp_path / "alone")
-    assert not same_state(tmp_path / "whole", tmp_path / "alone")
-
-
-@pytest.mark.slow
-def test_sigterm_to_the_launcher_saves_and_ends(tiny, tmp_path):
-    values = {k: v for k, v in tiny.items() if k != "steps"} | {"minutes": 5}
-    recipe = write_recipe(tmp_path / "long.toml", values)
-    call = f"launch({str(recipe)!r}, {str(tmp_path / 'run')!r}, 2)"
-    code = f"from gns_model.training import launch; raise SystemExit({call})"
-    process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT)
-    try:
-        deadline = time.monotonic() + 60
-        while not (tmp_path / "run" / "recipe.json").exists() and time.monotonic() < deadline:
-            time.sleep(0.2)
-        time.sleep(2)
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(60) == 0
-    finally:
-        process.kill()
-    position = read_position(tmp_path / "run" / "state.safetensors")
-    assert position.step > 0
-    assert position.seconds < 120
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ def test_there_are_recipes():
         ({"learning_rate": float("nan")}, "learning_rate"),
         ({"ema_decay": 1.0}, "ema_decay"),
         ({"schedule": "linear"}, "schedule"),
-        ({"model": {"baffles": "points", "types": 9}}, "baffles"),
+        ({"model": {"baffles": "points", "types": 5}}, "model.types must be 0 or at least 7"),
         ({"model": {"radius": 0.01}}, "radius"),
         ({"model": {"colour": "red"}}, "model.colour"),
     ],

@@ -1,0 +1,118 @@
+"""A model begins with the weights of another one, and sees at first no more than it did."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gns_model.data.windows import WindowIndex
+from gns_model.learned.checkpoint import load_model, save_model
+from gns_model.learned.config import ModelConfig
+from gns_model.learned.model import LearnedModel
+from gns_model.training import Recipe, RecipeError, train
+from gns_model.training.batches import collate
+from gns_model.training.transfer import inherit
+
+SIZE = {"spacing": 0.0625, "dt": 0.02, "radius": 0.1, "latent": 8, "blocks": 2}
+
+
+def build(seed: int = 0, **changes) -> LearnedModel:
+    torch.manual_seed(seed)
+    model = LearnedModel(ModelConfig(**{**SIZE, **changes}))
+    for name in ("velocity", "acceleration"):
+        getattr(model, f"{name}_mean").normal_()
+        getattr(model, f"{name}_std").uniform_(0.5, 2.0)
+    return model
+
+
+@pytest.fixture
+def parent(tmp_path):
+    model = build()
+    return save_model(tmp_path / "parent", model), model
+
+
+def batch(slides):
+    windows = WindowIndex([slides], spacing=0.0625, dt=0.02, history=3)
+    return collate(
+        [windows.read(k, 4, mixture=k) for k in (0, 1)],
+        noise_std=0.0,
+        rng=np.random.default_rng(0),
+        device=torch.device("cpu"),
+    )
+
+
+def test_weights_and_normalisation_are_copied(parent):
+    folder, model = parent
+    child = build(seed=1, noise_std=1e-5)
+    inherit(child, str(folder))
+    for key, value in model.state_dict().items():
+        assert torch.equal(child.state_dict()[key], value)
+
+
+@pytest.mark.parametrize("types", [0, 9])
+def test_new_material_features_change_nothing_at_first(tmp_path, slides, types):
+    """Also with a type embedding, whose inputs come after those of the material."""
+    given = batch(slides)
+    model = build(types=types)
+    folder = save_model(tmp_path / "parent", model)
+    child = build(seed=1, types=types, material_features=("base_friction", "tan_friction_angle"))
+    inherit(child, str(folder))
+    with torch.no_grad():
+        before = model.step(given.history, given.world)
+        torch.testing.assert_close(child.step(given.history, given.world), before, rtol=0, atol=0)
+    # But they can be learned: their weights have gradients.
+    child.acceleration(given.history, given.world).square().mean().backward()
+    first = child.network.encode_vertex.layers[0].weight
+    begin = model.config.vertex_inputs
+    assert (first[:, begin : begin + 2] == 0).all()
+    assert (first.grad[:, begin : begin + 2].abs().sum(0) > 0).all()
+
+
+def test_features_that_the_parent_knows_keep_their_weights_in_any_order(tmp_path, slides):
+    given = batch(slides)
+    model = build(material_features=("tan_friction_angle",))
+    folder = save_model(tmp_path / "parent", model)
+    child = build(seed=1, material_features=("base_friction", "tan_friction_angle"))
+    inherit(child, str(folder))
+    with torch.no_grad():
+        torch.testing.assert_close(
+            child.step(given.history, given.world), model.step(given.history, given.world)
+        )
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"latent": 16}, "its latent is 8, the recipe's 16"),
+        ({"radius": 0.11}, "its radius is 0.1, the recipe's 0.11"),
+        ({"baffles": "none"}, "baffles"),
+    ],
+)
+def test_another_architecture_is_refused_in_one_line(parent, changes, words):
+    with pytest.raises(RecipeError, match=words) as caught:
+        inherit(build(**changes), str(parent[0]))
+    assert "\n" not in str(caught.value)
+
+
+def test_other_parents_are_refused(parent, tmp_path):
+    with pytest.raises(RecipeError, match="no learned model"):
+        inherit(build(), "mpm")
+    with pytest.raises(RecipeError, match="nowhere"):
+        inherit(build(), str(tmp_path / "nowhere"))
+    rich = save_model(tmp_path / "rich", build(material_features=("base_friction",)))
+    with pytest.raises(RecipeError, match="it sees base_friction"):
+        inherit(build(), str(rich))
+
+
+def test_training_starts_from_the_parent(tiny, tmp_path):
+    """With a rate of almost nothing the child is still its parent after two steps, and its moving
+    average, too; a model that starts at random is not."""
+    first = train(Recipe.from_dict({**tiny, "valid": [], "steps": 3}), tmp_path / "first")
+    more = {**tiny, "valid": [], "steps": 2, "learning_rate": 1e-12, "seed": 5}
+    child = train(Recipe.from_dict({**more, "start_from": str(first)}), tmp_path / "child")
+    orphan = train(Recipe.from_dict(more), tmp_path / "orphan")
+    weights = [load_model(folder).model.network.decode.layers[0].weight for folder in
+               (first, child, orphan)]  # fmt: skip
+    torch.testing.assert_close(weights[1], weights[0], rtol=1e-6, atol=1e-7)
+    assert not torch.allclose(weights[2], weights[0], rtol=1e-2)
