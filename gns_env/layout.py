@@ -98,6 +98,9 @@ class LayoutSpace:
             )
         self._projectors: dict[int, Projector] = {}
 
+    def __getstate__(self) -> dict[str, object]:
+        return {**self.__dict__, "_projectors": {}}  # compiled programmes are made anew
+
     def encode(self, centres: ArrayLike) -> Array:
         """Centres (n, D-1) [m] as numbers in the unit box, shape (dim,): x, z of each in turn."""
         width = self.upper - self.lower

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium.error import InvalidAction, ResetNeeded, UnsupportedMode
+from gymnasium.error import InvalidAction, ResetNeeded
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
@@ -66,7 +66,7 @@ class GranularBaffleVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         if num_envs < 1:
             raise EnvError(f"num_envs must be 1 or more, got {num_envs}")
         if render_mode not in (None, "rgb_array"):
-            raise UnsupportedMode(
+            raise EnvError(
                 f"render_mode of the vector env must be None or 'rgb_array', got {render_mode!r}"
             )
         self.num_envs, self.render_mode = num_envs, render_mode

@@ -52,6 +52,28 @@ def site(flume: Scene, simulator: Simulator) -> Scene:
     return flume if simulator.name == "mpm" else flume.replace(duration=0.3)
 
 
+@pytest.fixture
+def tiny_scene() -> Scene:
+    """A 2D flow of two dozen points that rests in milliseconds, for thousands of steps."""
+    return Scene.from_dict(
+        {
+            "name": "tiny",
+            "duration": 0.25,
+            "section": 0.7,
+            "domain": {"lower": [0.0, 0.0], "upper": [1.2, 0.5]},
+            "release": [{"lower": [0.0, 0.0], "upper": [0.2, 0.3], "velocity": [1.0, 0.0]}],
+            "baffle": [{"center": [0.6], "size": [0.1, 0.15]}],
+            "placement": {"lower": [0.3], "upper": [1.1], "gap": 0.05},
+        }
+    )
+
+
+@pytest.fixture
+def tiny_mpm() -> MpmSimulator:
+    """The reference solver in a few milliseconds a rollout of `tiny_scene`."""
+    return MpmSimulator(spacing=0.05, frame_interval=0.05)
+
+
 class Faulty:
     """The coarse solver, made to fail as a network may: for scenes with `at_least` baffles."""
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 import subprocess
 import sys
 import warnings
@@ -11,11 +13,14 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.error import InvalidAction, ResetNeeded
-from gymnasium.utils.env_checker import check_env
+from gymnasium.utils.env_checker import check_env, data_equivalence
 
 import gns_env.env
-from gns_env.env import MEASURES
+from gns_env.cache import RolloutCache
+from gns_env.episode import flume as shipped_flume
+from gns_env.errors import EnvError, InvalidScenario
 from gns_env.objective import Objective, ObjectiveError
+from gns_env.observation import MEASURES, ORDER
 from gns_model.errors import GnsError, LayoutError, SceneError, SimulatorError
 from gns_model.mpm import MpmSimulator
 from gns_model.scene import Scene
@@ -51,9 +56,10 @@ def test_an_episode_places_its_baffles_and_rewards_what_they_save(
     env = make(site, simulator, n_baffles=3)
     observation, info = env.reset(seed=1)
     assert info["cost"] == pytest.approx(1.5)
-    assert info["centres"].shape == (0, 2)
+    assert info["centres"] == ()
     assert observation["placed"].sum() == 0
-    np.testing.assert_allclose(observation["measures"][:4], 1.0)
+    np.testing.assert_allclose(observation["measures"][:4], 0.5)
+    assert (observation["scenario"] == 0).all()
     assert 0 < observation["deposit"].max() <= 1
     start, total = info["cost"], 0.0
     actions = np.array([[-0.5, -0.4], [-0.5, 0.4], [0.2, 0.0]], np.float32)
@@ -70,7 +76,8 @@ def test_an_episode_places_its_baffles_and_rewards_what_they_save(
     # The same layout through the task, all at once, is the same.
     assert env.unwrapped.task.evaluate([info["centres"]])[0].cost == info["cost"]
     ratio = info["measures"]["centroid_travel"] / env.unwrapped.task.reference["centroid_travel"]
-    assert observation["measures"][MEASURES.index("centroid_travel")] == pytest.approx(ratio, 1e-5)
+    seen = observation["measures"][MEASURES.index("centroid_travel")]
+    assert seen == pytest.approx(ratio / (1 + ratio), 1e-5)
     with pytest.raises(ResetNeeded):
         env.step(actions[0])
 
@@ -89,7 +96,7 @@ def test_a_clash_is_resolved_and_told(small_flume: Scene, coarse_mpm: MpmSimulat
     _, _, _, _, second = env.step(np.zeros(2, np.float32))
     assert first["moved"] == 0
     assert second["moved"] == pytest.approx(0.15)  # one width and one gap along x
-    np.testing.assert_array_equal(second["centres"][:1], first["centres"])
+    assert second["centres"][:1] == first["centres"]
     assert env.unwrapped.task.space.check(second["centres"]) == []
 
 
@@ -113,15 +120,131 @@ def test_a_failed_rollout_ends_the_episode_with_finite_numbers(
     assert not env.step(np.array([-0.5, -0.5], np.float32))[2]
 
 
-def test_bad_actions(small_flume: Scene, coarse_mpm: MpmSimulator) -> None:
-    env = make(small_flume, coarse_mpm, n_baffles=1, disable_env_checker=True)
+@pytest.mark.parametrize("placement", ["sequential", "joint"])
+@pytest.mark.parametrize("action", ["continuous", "grid"])
+@pytest.mark.parametrize("observation", ["dict", "flat"])
+def test_every_kind_of_space(
+    tiny_scene: Scene, tiny_mpm: MpmSimulator, placement: str, action: str, observation: str
+) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = make(
+            tiny_scene, tiny_mpm, n_baffles=2,
+            placement=placement, action=action, observation=observation,
+        )  # fmt: skip
+        check_env(env.unwrapped)
+        env.action_space.seed(5)
+        observed, info = env.reset(seed=0)
+        steps, over, total, before = 0, False, 0.0, info["cost"]
+        while not over:
+            observed, reward, over, _, info = env.step(env.action_space.sample())
+            steps, total = steps + 1, total + reward
+    assert steps == (1 if placement == "joint" else 2)
+    assert total == pytest.approx(before - info["cost"])
+    assert env.unwrapped.task.space.check(info["centres"]) == []
+    assert observed in env.observation_space
+    assert len(info["centres"]) == 2
+
+
+def test_flat_is_the_dict_in_its_order(tiny_scene: Scene, tiny_mpm: MpmSimulator) -> None:
+    action = np.array([-0.6, 0.3], np.float32)
+    results = []
+    for observation in ("dict", "flat"):
+        env = make(tiny_scene, tiny_mpm, n_baffles=2, placement="joint", observation=observation)
+        env.reset(seed=0, options={"speed": 1.3})
+        results.append(env.step(action)[0])
+    np.testing.assert_array_equal(
+        np.concatenate([results[0][name].ravel() for name in ORDER]), results[1]
+    )
+    assert results[0]["scenario"][1] == pytest.approx(0.3)
+
+
+def test_the_grid_names_places(small_flume: Scene, coarse_mpm: MpmSimulator) -> None:
+    env = make(small_flume, coarse_mpm, n_baffles=2, action="grid", placement="joint")
+    grid, space = env.unwrapped.grid, env.unwrapped.task.space
+    assert env.action_space.nvec.tolist() == [len(grid)] * 2
+    np.testing.assert_allclose(grid[0], space.lower)
+    np.testing.assert_allclose(grid[-1], space.upper)
     env.reset()
-    for action in ([np.nan, 0.0], [0.0], [0.0, 0.0, 0.0]):
+    cells = np.array([len(grid) - 1, 0])
+    info = env.step(cells)[4]
+    np.testing.assert_allclose(info["centres"], grid[cells])
+    assert info["moved"] == 0
+
+
+@pytest.mark.parametrize("placement", ["sequential", "joint"])
+def test_what_cannot_be_built_is_moved_and_measured(
+    small_flume: Scene, coarse_mpm: MpmSimulator, placement: str
+) -> None:
+    env = make(small_flume, coarse_mpm, n_baffles=2, placement=placement)
+    env.reset()
+    if placement == "joint":  # both in the middle: apart by one width and one gap along x
+        info = env.step(np.zeros(4, np.float32))[4]
+        assert info["moved"] == pytest.approx(0.15 / 2**0.5, rel=1e-4)
+    else:  # far outside: drawn in to the corner, the whole way told
+        info = env.step(np.array([3.0, 1.0]))[4]
+        space = env.unwrapped.task.space
+        np.testing.assert_allclose(info["centres"], [space.upper])
+        assert info["moved"] == pytest.approx(space.upper[0] - space.lower[0])
+        env.step(np.array([np.inf, -np.inf]))
+    assert env.unwrapped.task.space.check(info["centres"]) == []
+
+
+@pytest.mark.parametrize("action", ["continuous", "grid"])
+def test_no_action_at_all_is_refused_and_changes_nothing(
+    small_flume: Scene, coarse_mpm: MpmSimulator, action: str
+) -> None:
+    env = make(small_flume, coarse_mpm, n_baffles=1, action=action, disable_env_checker=True)
+    env.reset()
+    bad = {
+        "continuous": ([np.nan, 0.0], [0.0], [0.0, 0.0, 0.0], "up", None),
+        "grid": (np.nan, -1, 10_000, 0.5, [1, 1], "up"),
+    }[action]
+    for wrong in bad:
         with pytest.raises(InvalidAction):
-            env.step(np.array(action))
-    _, _, _, _, info = env.step(np.array([7.0, -7.0]))  # clipped to the corner
-    space = env.unwrapped.task.space
-    np.testing.assert_allclose(info["centres"][0], [space.upper[0], space.lower[1]])
+            env.step(wrong)
+    _, _, terminated, _, _ = env.step(np.zeros(2) if action == "continuous" else 3)
+    assert terminated
+
+
+def test_known_layouts_are_not_simulated_twice_by_any_env_of_the_process(
+    tiny_scene: Scene, faulty: type
+) -> None:
+    simulator, cache = faulty("not at all"), RolloutCache()
+    first, second = (
+        make(tiny_scene, simulator, n_baffles=2, cache=cache, render_mode=mode)
+        for mode in (None, None)
+    )
+    for env in (first, second):
+        env.reset(seed=0)
+        for action in ([-0.5], [0.5]):
+            info = env.step(np.array(action, np.float32))[4]
+    assert sum(simulator.batches) == len(cache) == 3
+    second.reset(seed=0)  # the same layout in the other order; one baffle at 0.5 alone is new
+    for action in ([0.5], [-0.5]):
+        again = second.step(np.array(action, np.float32))[4]
+    assert sum(simulator.batches) == 4
+    assert again["cost"] == info["cost"]
+    assert again["centres"] == info["centres"][::-1]
+
+
+def test_copies_go_on_as_the_original(tiny_scene: Scene, tiny_mpm: MpmSimulator) -> None:
+    env = make(tiny_scene, tiny_mpm, n_baffles=3, scenarios="random", render_mode="rgb_array")
+    env.reset(seed=4)
+    env.step(np.array([-0.6], np.float32))
+    env.unwrapped.task.space.project([[0.5], [0.52], [0.5]])  # a compiled programme is left behind
+    copies = [pickle.loads(pickle.dumps(env)), copy.deepcopy(env)]
+    for action in ([0.1], [0.9]):
+        observation, reward, _, _, info = env.step(np.array(action, np.float32))
+        for other in copies:
+            theirs = other.step(np.array(action, np.float32))
+            assert data_equivalence(theirs[0], observation, exact=True)
+            assert theirs[1] == reward
+            assert theirs[4]["centres"] == info["centres"]
+    expected = env.reset()[1]["scenario"]
+    for other in copies:
+        assert data_equivalence(other.reset()[1]["scenario"], expected, exact=True)
+    assert copies[1].unwrapped.problem.cache is env.unwrapped.problem.cache  # the process's
 
 
 def test_it_is_found_by_its_module_name_in_a_fresh_process() -> None:
@@ -137,27 +260,10 @@ def test_it_is_found_by_its_module_name_in_a_fresh_process() -> None:
     assert done.stdout.split() == ["GranularBaffle-v0", "8", "mpm"], done.stderr
 
 
-def test_many_at_once(small_flume: Scene, coarse_mpm: MpmSimulator) -> None:
-    envs = gymnasium.make_vec(
-        "GranularBaffle-v0",
-        2,
-        vectorization_mode="sync",
-        scene=small_flume.replace(duration=0.15),
-        simulator=coarse_mpm,
-        n_baffles=1,
-    )
-    observations, _ = envs.reset(seed=0)
-    assert observations["layout"].shape == (2, 1, 2)
-    _, rewards, terminated, _, _ = envs.step(np.array([[0, 0], [0.5, 0.5]], np.float32))
-    assert terminated.all()
-    assert np.isfinite(rewards).all()
-    envs.close()
-
-
 def test_the_shipped_scene_is_the_example(examples: Path, flume: Scene) -> None:
     shipped = Path(gns_env.__file__).parent / "scenes" / "flume.toml"
     assert shipped.read_bytes() == (examples / "flume.toml").read_bytes()
-    assert gns_env.env.flume() == flume
+    assert shipped_flume() == flume
 
 
 @pytest.mark.parametrize(
@@ -168,7 +274,16 @@ def test_the_shipped_scene_is_the_example(examples: Path, flume: Scene) -> None:
         ({"n_baffles": 500}, LayoutError, "at most"),
         ({"n_baffles": 0}, LayoutError, "1 or more"),
         ({"objective": Objective.pareto()}, ObjectiveError, "one Objective"),
-        ({"render_mode": "ansi"}, ValueError, "rgb_array"),
+        ({"render_mode": "ansi"}, EnvError, "rgb_array"),
+        ({"placement": "random"}, EnvError, "'sequential' or 'joint'"),
+        ({"action": "discrete"}, EnvError, "'continuous' or 'grid'"),
+        ({"observation": "image"}, EnvError, "'dict' or 'flat'"),
+        ({"scene": 3}, EnvError, "path of one"),
+        ({"workers": 2, "simulator": MpmSimulator()}, EnvError, "given by name"),
+        ({"scenarios": "some"}, InvalidScenario, "'random'"),
+        ({"scenarios": {"colour": (0, 1)}}, InvalidScenario, "unknown key 'colour'"),
+        ({"scenarios": {"speed": (1.0, float("nan"))}}, InvalidScenario, "range"),
+        ({"scenarios": {"volume": (1.0, 2.0)}}, InvalidScenario, "0.4"),
     ],
 )
 def test_bad_arguments_are_refused_when_it_is_made(
@@ -177,9 +292,12 @@ def test_bad_arguments_are_refused_when_it_is_made(
     arguments = {"simulator": "mpm", **arguments}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # gymnasium warns of the render mode before we refuse it
-        with pytest.raises(error, match=message) as caught:
-            gymnasium.make("GranularBaffle-v0", **arguments)
-    assert "\n" not in str(caught.value)
+        for make_it in (gymnasium.make, gymnasium.make_vec):
+            with pytest.raises(error, match=message) as caught:
+                make_it("GranularBaffle-v0", **arguments)
+            assert isinstance(caught.value, gymnasium.error.Error)
+            assert isinstance(caught.value, GnsError)
+            assert "\n" not in str(caught.value)
 
 
 def test_the_default_simulator_is_the_shipped_model_or_one_clear_line(
@@ -196,5 +314,6 @@ def test_the_default_simulator_is_the_shipped_model_or_one_clear_line(
 def test_a_spatial_model_refuses_a_plane_scene(plane_scene: Scene, is_shipped: bool) -> None:
     if not is_shipped:
         pytest.skip("no model is shipped yet")
-    with pytest.raises(SimulatorError):
+    with pytest.raises(SimulatorError, match="2D") as caught:
         gymnasium.make("GranularBaffle-v0", scene=plane_scene, n_baffles=1)
+    assert isinstance(caught.value, gymnasium.error.Error)
