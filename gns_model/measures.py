@@ -25,7 +25,7 @@ from typing import Literal
 import numpy as np
 
 from gns_model.errors import SceneError, SimulatorError
-from gns_model.particles import MOVING
+from gns_model.particles import STATIONARY
 from gns_model.scene import Scene
 from gns_model.trajectory import Trajectory
 
@@ -379,7 +379,7 @@ def moving_positions(trajectory: Trajectory) -> np.ndarray:
     Raises:
         SimulatorError: if no point moves, or the first frame is not finite.
     """
-    positions, moving = trajectory.positions, trajectory.particle_type == MOVING
+    positions, moving = trajectory.positions, trajectory.particle_type != STATIONARY
     if not moving.any() or len(positions) == 0:
         raise SimulatorError(f"a trajectory of {trajectory.simulator!r} holds no moving point")
     if not moving.all():
