@@ -1,7 +1,7 @@
 """A random agent places three baffles in the paper's flume, through the Gymnasium env alone.
 
-    python examples/random_agent.py                                     # the shipped model
-    python examples/random_agent.py --simulator mpm --spacing 0.0625    # the solver, coarse and fast
+    python examples/random_agent.py                                    # the shipped model
+    python examples/random_agent.py --simulator mpm --spacing 0.0625   # the solver, coarse, fast
 
 It ends in a check of its own result: rewards add up to the cost saved, and baffles hold mass back.
 """

@@ -5,6 +5,7 @@ from __future__ import annotations
 import runpy
 import sys
 import warnings
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -120,7 +121,7 @@ def test_record_video_keeps_a_film_of_the_episode(make: Any, tmp_path: Path) -> 
     with moviepy.VideoFileClip(str(film)) as clip:
         frames = [clip.get_frame(t) for t in (0.1, 0.6, 1.1)]
         assert clip.n_frames == 3
-    assert all((a != b).mean() > 0.001 for a, b in zip(frames, frames[1:], strict=False))
+    assert all((a != b).mean() > 0.001 for a, b in pairwise(frames))
 
 
 def test_human_rendering(make: Any, monkeypatch: pytest.MonkeyPatch) -> None:
