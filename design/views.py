@@ -18,7 +18,7 @@ from matplotlib.ticker import MultipleLocator
 from scipy.ndimage import gaussian_filter
 
 from design.theme import Theme
-from gns_env.rendering import depth_map
+from gns_env.deposit import depth_map
 from gns_model.measures import moving_positions
 from gns_model.scene import Scene
 from gns_model.trajectory import Trajectory

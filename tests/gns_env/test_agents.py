@@ -17,6 +17,7 @@ from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.wrappers import RecordEpisodeStatistics, RecordVideo
 
 import gns_env
+from gns_env.env import GranularBaffleEnv
 from gns_model.mpm import MpmSimulator
 from gns_model.scene import Scene
 
@@ -127,8 +128,8 @@ def test_record_video_keeps_a_film_of_the_episode(make: Any, tmp_path: Path) -> 
 def test_human_rendering(make: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pygame", reason="the extra [rl] is not installed")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    monkeypatch.setitem(GranularBaffleEnv.metadata, "render_fps", 50)
     env = make(render_mode="human")
-    env.metadata["render_fps"] = 50
     env.reset(seed=0)
     shown = env.unwrapped._window._surface
     import pygame
@@ -139,7 +140,9 @@ def test_human_rendering(make: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     assert env.render() is None
     env.close()
     assert env.unwrapped._window is None
-    check_env(make(render_mode="human").unwrapped)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(make(render_mode="human").unwrapped)
 
 
 def test_human_rendering_without_pygame_is_one_clear_error(

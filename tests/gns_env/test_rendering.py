@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from gns_env.rendering import BAFFLE, Film, depth_map, frame_image, plan_view, side_view
+from gns_env.deposit import depth_map
+from gns_env.rendering import BAFFLE, Film, frame_image, plan_view, rest_image, side_view
+from gns_env.task import BaffleTask, simulate
+from gns_model.measures import upstream_depth_over_time
 from gns_model.mpm import MpmSimulator
 from gns_model.scene import Scene
 from gns_model.trajectory import Trajectory
@@ -50,6 +53,33 @@ def test_images_are_fresh_and_show_the_flow_and_the_baffle(spatial: Trajectory) 
     colour = np.array([int(BAFFLE[k : k + 2], 16) for k in (1, 3, 5)])
     assert (np.abs(first.astype(int) - colour).max(axis=2) < 4).sum() > 200
     np.testing.assert_array_equal(frame_image(spatial, 0), first)
+
+
+def test_the_deposit_is_drawn_with_the_peak_depth_at_every_baffle(small_flume: Scene) -> None:
+    task = BaffleTask(small_flume, MpmSimulator(spacing=0.05), n_baffles=2)
+    layout = np.array([[0.65, 0.2], [0.45, 0.4]])  # not in the order of the scene
+    whole = task.evaluate([layout], trajectories=True)[0]
+    outcome, rest = simulate([(task, layout)], keep="rest")[0]
+    state = task.judge(layout, outcome, rest)
+    np.testing.assert_allclose(
+        np.sort(state.depths), np.sort(upstream_depth_over_time(whole.trajectory).max(axis=0))
+    )
+    assert state.depths[1] > state.depths[0]  # the one upstream meets the deeper flow
+    assert state.depths.max() == pytest.approx(state.measures["upstream_depth"])
+    assert len(rest.positions) == 2
+    image = rest_image(state, task)
+    # The last two frames draw what the whole trajectory does.
+    np.testing.assert_array_equal(image, rest_image(whole, task))
+    film = Film(rest)
+    plain = film.image(-1, "the same")
+    film.mark_depths(state.depths[[1, 0]])
+    marked = film.image(-1, "the same")
+    changed = (plain != marked).any(axis=2)
+    assert changed.sum() > 100
+    blue = np.abs(marked.astype(int) - [0x15, 0x65, 0xA8]).max(axis=2) < 40
+    assert (blue & changed).sum() > 40
+    with pytest.raises(ValueError, match="last frames"):
+        rest_image(task.evaluate([layout])[0], task)
 
 
 def test_a_plane_scene_has_a_side_view_alone(plane: Trajectory) -> None:
