@@ -39,13 +39,20 @@ def load_simulator(name: str | os.PathLike[str], device: str = "cpu", **options:
     Args:
         name: "mpm" (the reference solver), the name of a shipped model such as "baffle-lite",
             or the path of a checkpoint folder.
-        device: torch device of a learned simulator; the reference solver runs on the CPU.
+        device: torch device. On the CPU the reference solver is the one in numba, `MpmSimulator`;
+            on "cuda" the same scheme in torch, `TorchMpmSimulator`: one thing under one name, and
+            results agree within round-off.
         options: passed on to the simulator, e.g. `spacing` for "mpm".
 
     Raises:
         SimulatorError: if there is no such simulator, or it has no such option.
         FileFormatError: if the checkpoint is truncated or is not ours.
     """
+    if str(name) == "mpm" and device != "cpu":
+        from gns_model.mpm.torch_solver import TorchMpmSimulator
+
+        _check_options(TorchMpmSimulator, device=device, **options)
+        return TorchMpmSimulator(device=device, **options)
     if str(name) == "mpm":
         from gns_model.mpm import MpmSimulator
 
