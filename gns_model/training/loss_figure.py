@@ -18,53 +18,66 @@ MEASURES = ("#4477aa", "#ccaa22", "#228833", "#aa3377", "#66ccee", "#cc6644")
 #: Share of the run that the smoothed training loss looks back over.
 SMOOTHING = 0.02
 
+LABELS = {
+    "runout_max": "runout of the front",
+    "centroid_travel": "centroid travel",
+    "runout_p99": "runout, 99%",
+    "upstream_depth": "upstream depth",
+    "mass_past_section": "mass past section",
+    "energy": "energy over time",
+}
+
 #: Columns of the validation log that are no relative errors.
 OTHER = ("step", "seconds", "score", "one_step", "slope", "diverged")
 
 
 def plot(out: Path) -> None:
-    """Draw `loss.png` from the logs in `out`: above the losses over the steps, on a log axis; below
-    the relative errors of the validation rollouts and their score."""
+    """Draw `loss.png` from the logs in `out`, all over the steps and on log axes: the losses, the
+    relative errors of the validation rollouts, and their score."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogFormatter
+
+    class Plain(LogFormatter):
+        """Chooses as its parent which ticks get a label, and writes 0.1 for 1e-01."""
+
+        def __call__(self, x: float, pos: int | None = None) -> str:
+            return f"{x:g}" if super().__call__(x, pos) else ""
 
     log, checks = read_table(out / LOG), read_table(out / VALIDATION)
     if not log:
         return
-    figure = Figure(figsize=(7.2, 6.2 if checks else 3.6), layout="constrained")
+    heights = (2.0, 1.5, 0.8) if checks else (1.0,)
+    figure = Figure(figsize=(7.2, 7.4 if checks else 3.4), layout="constrained")
     FigureCanvasAgg(figure)
-    rows = figure.subplots(2 if checks else 1, 1, sharex=True, squeeze=False)[:, 0]
-    top = rows[0]
+    rows = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
     steps, losses = _columns(log, "step", "loss")
-    top.plot(steps, losses, color=TRAINING, lw=0.6, alpha=0.35)
-    top.plot(steps, smoothed(losses), color=TRAINING, lw=1.8, label="training, with noise")
+    rows[0].plot(steps, losses, color=TRAINING, lw=0.6, alpha=0.4)
+    rows[0].plot(steps, smoothed(losses), color=TRAINING, lw=1.8, label="training, with noise")
+    rows[0].set_ylabel("loss: mean square of\nnormalised acceleration")
     if checks:
-        at, held_out = _columns(checks, "step", "one_step")
-        top.plot(at, held_out, "o-", color=HELD_OUT, ms=4, lw=1.5, label="held out, without noise")
-        bottom = rows[1]
+        x, y = _columns(checks, "step", "one_step")
+        rows[0].plot(x, y, "o-", color=HELD_OUT, ms=4, lw=1.5, label="held out, without noise")
         names = [n for n in dict.fromkeys(n for row in checks for n in row) if n not in OTHER]
         for name, color in zip(names, MEASURES * len(names), strict=False):
-            label = name.replace("_", " ").replace("p99", "(99%)").replace("max", "(front)")
             x, y = _columns(checks, "step", name)
-            bottom.plot(x, 100 * y, "o-", color=color, ms=3.5, lw=1.3, label=label)
+            rows[1].plot(
+                x, 100 * y, "o-", color=color, ms=3.5, lw=1.3, label=LABELS.get(name, name)
+            )
+        rows[1].set_ylabel("error of held-out\nrollouts [%]")
         x, y = _columns(checks, "step", "score")
-        score = bottom.twinx()
-        score.plot(x, y, "s--", color=SCORE, ms=4, lw=1.5, label="score (right)")
-        score.set(ylabel="score: mean of error / aim", yscale="log")
-        score.spines["top"].set_visible(False)
-        bottom.set(ylabel="error of held-out rollouts [%]", yscale="log")
-        handles = [axes.get_legend_handles_labels() for axes in (bottom, score)]
-        bottom.legend(
-            *(a + b for a, b in zip(*handles, strict=True)),
-            loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=4, frameon=False, fontsize=8,
-        )  # fmt: skip
-        bottom.spines["top"].set_visible(False)
-    top.set(ylabel="loss: mean square of\nnormalised acceleration", yscale="log")
-    top.legend(frameon=False, fontsize=8)
-    top.spines[["top", "right"]].set_visible(False)
-    rows[-1].set_xlabel("optimiser step")
+        rows[2].plot(x, y, "s-", color=SCORE, ms=4, lw=1.5)
+        rows[2].set_ylabel("score: mean of\nerror / aim")
     for axes in rows:
+        axes.set_yscale("log")
+        for choose in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
+            choose(Plain(labelOnlyBase=False, minor_thresholds=(1.5, 0.6)))
+        axes.tick_params(axis="y", which="minor", labelsize=8)
+        axes.spines[["top", "right"]].set_visible(False)
         axes.grid(axis="y", which="major", lw=0.4, color="#cfc8bc")
+    for axes in rows[:2]:
+        axes.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    rows[-1].set_xlabel("optimiser step")
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=130)
     write_whole(out / PLOT, content.getvalue())
@@ -72,7 +85,7 @@ def plot(out: Path) -> None:
 
 def smoothed(values: np.ndarray) -> np.ndarray:
     """Exponential moving average over `SMOOTHING` of the values, unbiased from the first on."""
-    decay = 1 - 1 / max(1.0, SMOOTHING * len(values))
+    decay = 1 - 1 / max(3.0, SMOOTHING * len(values))
     total, weight, out = 0.0, 0.0, np.empty(len(values))
     for k, value in enumerate(values):
         total, weight = decay * total + value, decay * weight + 1

@@ -37,7 +37,7 @@ def main(recipe_file: str, folder: str, count: str) -> None:
             os.dup2(log, 1)
             train(recipe, out)
             os._exit(1)
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + 300
         while not (state.exists() and state.stat().st_mtime_ns > before):
             if time.monotonic() > deadline:
                 raise SystemExit(f"child {k} saved nothing")

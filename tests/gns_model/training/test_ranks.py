@@ -20,6 +20,8 @@ from gns_model.training.state import read_position
 ROOT = Path(__file__).parents[3]
 BIN = Path(sys.executable).parent
 STATE = "state.safetensors"
+#: Seconds after which something hangs, also where many processes share few cores.
+PATIENCE = 500
 
 
 def torchrun(*arguments: str) -> list[str]:
@@ -41,16 +43,23 @@ def start(command: list[str]) -> subprocess.Popen[str]:
 def terminate_once_training(process: subprocess.Popen[str], out: Path) -> tuple[int, float]:
     """Exit code after SIGTERM, and the seconds that the end took."""
     try:
-        deadline = time.monotonic() + 120
+        deadline = time.monotonic() + PATIENCE
         while not (out / STATE).exists() and time.monotonic() < deadline:
             assert process.poll() is None, process.communicate()
             time.sleep(0.1)
         process.send_signal(signal.SIGTERM)
         began = time.monotonic()
-        process.communicate(timeout=60)
+        process.communicate(timeout=PATIENCE)
         return process.returncode, time.monotonic() - began
     finally:
         process.kill()
+
+
+def slowdown() -> float:
+    """How much slower this machine is now than one where importing torch takes four seconds."""
+    began = time.monotonic()
+    subprocess.run([sys.executable, "-c", "import torch"], check=True)
+    return max(1.0, (time.monotonic() - began) / 4)
 
 
 def test_one_process_is_a_rank_of_one(monkeypatch):
@@ -99,7 +108,7 @@ def test_two_ranks_resume_bit_exactly_and_torchrun_does_what_the_launcher_does(
     module = start(
         torchrun("-m", "gns_model.cli", "train", str(whole), "--out", str(tmp_path / "t"))
     )
-    output, errors = module.communicate(timeout=120)
+    output, errors = module.communicate(timeout=PATIENCE)
     assert module.returncode == 0, errors
     assert output.strip().splitlines()[-1] == str(tmp_path / "t" / "last")
     assert same_state(tmp_path / "parts", tmp_path / "t")
@@ -120,10 +129,10 @@ def test_sigterm_saves_and_ends(tiny, tmp_path, write_recipe, way):
     code, seconds = terminate_once_training(start(command), out)
     # torchrun reports the signal that ended it; our launcher, that all went well.
     assert code == 0 if way == "launcher" else code != 0
-    assert seconds < 10
+    assert seconds < 10 * slowdown()
     position = read_position(out / STATE)
     assert position.step > 0
-    assert position.seconds < 120
+    assert position.seconds < 300
 
 
 @pytest.mark.slow
@@ -134,13 +143,13 @@ def test_a_rank_that_dies_ends_the_run_with_what_was_learned(tiny, tmp_path, wri
     command = [str(BIN / "gns-model"), "train", str(recipe), "--out", str(out), "--ranks", "2"]
     process = start(command)
     try:
-        deadline = time.monotonic() + 120
+        deadline = time.monotonic() + PATIENCE
         while not (out / "log.csv").exists() and time.monotonic() < deadline:
             time.sleep(0.1)
         for child in _children(process.pid):
             if b"RANK=1" in Path(f"/proc/{child}/environ").read_bytes().split(b"\0"):
                 os.kill(child, signal.SIGKILL)
-        _, errors = process.communicate(timeout=60)
+        _, errors = process.communicate(timeout=PATIENCE)
     finally:
         process.kill()
     assert process.returncode != 0

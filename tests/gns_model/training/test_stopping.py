@@ -124,7 +124,7 @@ def test_kill_9_at_random_moments_leaves_checkpoints_that_load(tiny, tmp_path, w
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=400,
+        timeout=1200,
         check=False,
     )
     assert result.returncode == 0, result.stdout + result.stderr
