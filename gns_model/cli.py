@@ -30,6 +30,13 @@ Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 CORES = os.cpu_count() or 1
 
 
+class Solver(StrEnum):
+    """Engines of the reference solver."""
+
+    numba = "numba"
+    torch = "torch"
+
+
 class Family(StrEnum):
     """Families of random scenes."""
 
@@ -139,6 +146,12 @@ def generate(
     frame_interval: Annotated[
         float, typer.Option(min=1e-6, help="Between stored frames [s].")
     ] = 0.01,
+    solver: Annotated[
+        Solver | None,
+        typer.Option(help="Engine of the solver.", show_default="numba; on a GPU torch"),
+    ] = None,
+    device: Annotated[str, typer.Option(help="cpu; for torch also cuda.")] = "cpu",
+    batch: Annotated[int, typer.Option(min=1, help="Scenes at once, for torch.")] = 32,
     shard: Annotated[str, typer.Option(help="i/n: make every n-th trajectory from the i-th.")] = (
         "0/1"
     ),
@@ -158,6 +171,9 @@ def generate(
             spacing=spacing,
             frame_interval=frame_interval,
             workers=workers,
+            solver=solver and solver.value,
+            device=device,
+            batch=batch,
             shard=parse_shard(shard),
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )

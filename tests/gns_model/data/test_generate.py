@@ -1,0 +1,100 @@
+"""A dataset is the same whoever makes it, and a rerun goes on where an earlier one stopped."""
+
+import numpy as np
+import pytest
+
+from gns_model import cli, console
+from gns_model.data.generate import file_name, generate
+from gns_model.errors import FileFormatError, GnsError, SimulatorError
+from gns_model.trajectory import Trajectory
+
+WANTED = {"family": "barriers", "count": 3, "seed": 4, "spacing": 0.1, "frame_interval": 0.02}
+
+
+@pytest.fixture(scope="module")
+def by_torch(tmp_path_factory):
+    """A folder made by the torch solver in batches of two, and the progress that it told."""
+    folder, told = tmp_path_factory.mktemp("torch"), []
+    generate(folder, **WANTED, solver="torch", batch=2, progress=lambda *a: told.append(a))
+    return folder, told
+
+
+def test_torch_makes_the_files_that_numba_makes(by_torch, tmp_path):
+    folder, told = by_torch
+    names = [file_name("barriers", 4, i) for i in range(3)]
+    assert sorted(p.name for p in folder.iterdir()) == names
+    assert told == sorted(told)
+    assert (told[0], told[-1]) == ((0, 3), (3, 3))
+    paths = generate(tmp_path, **WANTED, workers=1)
+    assert [p.name for p in paths] == names
+    for path in paths:
+        a, b = Trajectory.load(path), Trajectory.load(folder / path.name)
+        assert a.scene == b.scene
+        assert (a.status, a.simulator, a.point_volume) == (b.status, b.simulator, b.point_volume)
+        np.testing.assert_allclose(a.positions, b.positions, rtol=0, atol=1e-6)
+        np.testing.assert_array_equal(a.time, b.time)
+        np.testing.assert_array_equal(a.lattice, b.lattice)
+
+
+def test_an_interrupt_keeps_whole_batches_and_a_rerun_goes_on(by_torch, tmp_path):
+    def interrupt(done, total):
+        if done > 2:  # within the second batch
+            raise KeyboardInterrupt
+
+    wanted = {**WANTED, "solver": "torch", "batch": 2}
+    with pytest.raises(KeyboardInterrupt):
+        generate(tmp_path, **wanted, progress=interrupt)
+    made = sorted(tmp_path.iterdir())
+    assert [p.name for p in made] == [file_name("barriers", 4, i) for i in range(2)]
+    before = [p.read_bytes() for p in made]
+    told = []
+    generate(tmp_path, **wanted, progress=lambda *a: told.append(a))
+    assert told[0] == (2, 3)
+    assert [p.read_bytes() for p in made] == before, "a finished file was made again"
+    for path in sorted(tmp_path.iterdir()):
+        np.testing.assert_array_equal(
+            Trajectory.load(path).positions, Trajectory.load(by_torch[0] / path.name).positions
+        )
+
+
+@pytest.mark.parametrize("other", [{"spacing": 0.05}, {"frame_interval": 0.01}])
+def test_files_of_another_dataset_are_refused(by_torch, other):
+    with pytest.raises(FileFormatError, match=next(iter(other))):
+        generate(by_torch[0], **{**WANTED, **other}, solver="torch")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"solver": "numba", "device": "cuda"}, "runs on the CPU"),
+        ({"solver": "fortran"}, "numba or torch"),
+        ({"device": "quantum"}, "quantum"),
+        ({"solver": "torch", "batch": 0}, "batch"),
+    ],
+)
+def test_a_solver_or_device_that_is_not_there_is_refused(tmp_path, options, message):
+    with pytest.raises(SimulatorError, match=message):
+        generate(tmp_path, **WANTED, **options)
+    assert issubclass(SimulatorError, GnsError)
+
+
+def test_the_command_takes_solver_device_and_batch(tmp_path, capsys):
+    def run(*more):
+        with pytest.raises(SystemExit) as left:
+            console.main(
+                cli.app,
+                "gns-model",
+                ["generate", "--out", str(tmp_path), "--family", "barriers", "--count", "1",
+                 "--spacing", "0.1", "--frame-interval", "0.2", "--quiet", *more],
+            )  # fmt: skip
+        return left.value.code, *capsys.readouterr()
+
+    code, out, _ = run("--solver", "torch", "--device", "cpu", "--batch", "4")
+    assert code in (0, None)
+    assert "1 trajectories" in out
+    settings = Trajectory.load(tmp_path / file_name("barriers", 0, 0)).settings
+    assert (settings["device"], settings["batch"]) == ("cpu", 4)
+    for wrong in (["--solver", "numba", "--device", "cuda"], ["--solver", "magic"]):
+        code, _, error = run(*wrong)
+        assert code == 2
+        assert len(error.splitlines()) == 1
