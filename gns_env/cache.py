@@ -143,7 +143,7 @@ def _identity(simulator: Any) -> Hashable:
     object itself, so whoever changes such an object in place should use another cache.
     """
     kind = f"{type(simulator).__module__}.{type(simulator).__qualname__}"
-    if kind == "gns_model.mpm.solver.MpmSimulator":
+    if kind in _SOLVERS:
         settings = simulator.settings()
         return kind, tuple((k, v) for k, v in settings.items() if k not in _NO_MATTER)
     try:
@@ -164,6 +164,7 @@ def _weights(simulator: Any) -> str:
     return digest.hexdigest()
 
 
-#: Settings that the answer of the reference solver does not depend on.
-_NO_MATTER = ("threads", "workers")
+_SOLVERS = ("gns_model.mpm.solver.MpmSimulator", "gns_model.mpm.torch_solver.TorchMpmSimulator")
+#: Settings that the answer of a reference solver does not depend on.
+_NO_MATTER = ("threads", "workers", "batch", "cuda_graph")
 _IDENTITIES: WeakKeyDictionary[Any, str] = WeakKeyDictionary()

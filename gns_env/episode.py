@@ -26,6 +26,7 @@ from gns_env.observation import Observer
 from gns_env.scenario import Scenario, ScenarioSpace
 from gns_env.task import BaffleTask, Evaluation, simulate
 from gns_model.errors import GnsError
+from gns_model.particles import fill
 from gns_model.scene import Scene
 from gns_model.simulator import Simulator, load_simulator
 
@@ -117,8 +118,12 @@ class Problem:
     def task(self, scenario: Scenario) -> BaffleTask:
         """The task of a scenario; one object for the same scenario, while it is remembered."""
         if scenario not in self._tasks:
+            scene = self.scenarios.apply(scenario)
+            spacing = getattr(self.simulator, "spacing", None)
+            if spacing is not None:
+                fill(scene, spacing)  # a release may have become too thin for the points
             self._tasks[scenario] = BaffleTask(
-                self.scenarios.apply(scenario),
+                scene,
                 self.simulator,
                 n_baffles=self.n_baffles,
                 objective=self.objective,

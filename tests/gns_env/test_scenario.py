@@ -143,6 +143,16 @@ def test_a_flow_that_leaves_no_room_for_baffles_is_refused(
         make(small_flume, coarse_mpm, n_baffles=60)
 
 
+def test_a_release_too_thin_for_the_points_is_no_flow(
+    tiny_scene: Scene, tiny_mpm: MpmSimulator
+) -> None:
+    with pytest.raises(InvalidScenario, match="thinner than the spacing"):
+        make(tiny_scene, MpmSimulator(spacing=0.15), scenarios={"volume": (0.016, 0.02)})
+    env = make(tiny_scene, MpmSimulator(spacing=0.19), scenarios={"volume": (0.03, 0.07)})
+    for seed in range(5):  # some of these draws had to be drawn again
+        assert env.unwrapped.problem.draw(np.random.default_rng(seed), None)[0].volume > 0.054
+
+
 def test_the_seed_decides_every_episode(tiny_scene: Scene, tiny_mpm: MpmSimulator) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
