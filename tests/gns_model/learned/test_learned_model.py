@@ -4,8 +4,6 @@ import pytest
 import torch
 
 from gns_model.learned import World
-from gns_model.learned.config import ModelConfig
-from gns_model.learned.model import LearnedModel
 from gns_model.learned.world import baffle_boxes, baffle_points
 from gns_model.particles import MOVING, STATIONARY, fill
 
@@ -23,17 +21,6 @@ def start(model, scene, dtype=torch.float32, seed=0):
     )  # fmt: skip
     history = points[:, None] + 0.003 * walk.cumsum(1)
     return history, World.from_scenes([scene], [len(points)], dtype=dtype)
-
-
-@pytest.mark.parametrize(("dim", "count"), [(2, 1_591_826), (3, 1_592_979)])
-def test_parameter_count_of_the_paper(dim, count):
-    model = LearnedModel(ModelConfig.paper(dim))
-    assert sum(p.numel() for p in model.parameters()) == count
-
-
-def test_the_papers_vertex_input_is_30_wide_in_2d():
-    config = ModelConfig.paper(2)
-    assert (config.vertex_inputs + config.type_embedding, config.edge_inputs) == (30, 3)
 
 
 @DIMS
@@ -184,6 +171,25 @@ def test_material_features_reach_the_output(make_model, make_scene):
             steps.append(model.step(history, World.from_scenes([scene], [len(history)])))
     assert not torch.equal(steps[0], steps[1])
     assert not torch.equal(steps[0], steps[2])
+
+
+def test_friction_of_every_point_takes_the_place_of_the_scenes(make_model, make_scene):
+    model = make_model(material_features=("tan_friction_angle", "base_friction"))
+    soft, hard = (make_scene(material={"friction_angle": a}) for a in (20.0, 40.0))
+    history, _ = start(model, soft)
+    tangents = torch.tensor([20.0, 40.0]).deg2rad().tan()
+    half = len(history) // 2
+    mixed = torch.cat([tangents[0].expand(half), tangents[1].expand(len(history) - half)])
+    count = [len(history)]
+    with torch.no_grad():
+        for friction, scene in ((tangents[0], soft), (tangents[1], hard)):
+            given = World.from_scenes([soft], count, tan_friction=friction.expand(len(history)))
+            expected = model.step(history, World.from_scenes([scene], count))
+            torch.testing.assert_close(model.step(history, given), expected, atol=1e-7, rtol=0)
+        seen = World.from_scenes([soft, hard], [half, len(history) - half]).point_material
+    torch.testing.assert_close(
+        World.from_scenes([soft], count, tan_friction=mixed).point_material, seen
+    )
 
 
 def test_refuses_a_history_of_another_length(make_model, make_scene):

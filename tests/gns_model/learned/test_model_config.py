@@ -24,6 +24,11 @@ def test_round_trip_as_json():
         {"dt": float("nan")},
         {"activation": "gelu"},
         {"wings": 2},
+        {"edge_update": "tripled"},
+        {"hidden": 0},
+        {"wall_clip": -1.0},
+        {"bounds": ((0.0, 1.0), (0.0, 1.0))},
+        {"bounds": ((0.0, 1.0), (0.0, 1.0), (1.0, 0.0))},
     ],
 )
 def test_refuses(options):

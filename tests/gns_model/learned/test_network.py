@@ -7,19 +7,8 @@ import torch
 from torch import nn
 
 from gns_model.learned import edge_kernel
-from gns_model.learned.edge_kernel import add_messages
 from gns_model.learned.graph import radius_graph
 from gns_model.learned.network import MLP, Block, EncodeProcessDecode
-
-
-def test_worked_example_of_the_paper():
-    vertex = torch.tensor([[1.0, 0, 2], [1, 3, 2]])
-    message = (vertex[0] + vertex[1]) * torch.tensor([2.0, 1, 0])
-    assert message.tolist() == [4, 3, 0]
-    messages = torch.stack([message, torch.tensor([0.0, 3, 9]), torch.tensor([3.0, 4, 9])])
-    total = add_messages(torch.zeros(2, 3), torch.tensor([0, 0, 0]), messages)
-    assert total.tolist() == [[7, 10, 18], [0, 0, 0]]
-    assert (vertex[0] + total[0]).tolist() == [8, 10, 20]
 
 
 def example(n: int = 150, dtype: torch.dtype = torch.float64):
@@ -32,11 +21,10 @@ def example(n: int = 150, dtype: torch.dtype = torch.float64):
     return vertex, edge, senders, receivers, weight
 
 
-def network(activation: str = "silu", hidden_layers: int = 2) -> EncodeProcessDecode:
+def network(activation: str = "silu", hidden_layers: int = 2, **options) -> EncodeProcessDecode:
     torch.manual_seed(4)
-    return EncodeProcessDecode(
-        5, 4, 3, latent=8, hidden_layers=hidden_layers, blocks=2, activation=activation
-    ).double()
+    sizes = {"latent": 8, "hidden_layers": hidden_layers, "blocks": 2, **options}
+    return EncodeProcessDecode(5, 4, 3, activation=activation, **sizes).double()
 
 
 def textbook(net: EncodeProcessDecode, vertex, edge, senders, receivers, weight):
@@ -47,7 +35,7 @@ def textbook(net: EncodeProcessDecode, vertex, edge, senders, receivers, weight)
         weighted = message if weight is None else message * weight
         total = torch.zeros_like(vertex).index_add(0, receivers, weighted)
         vertex = vertex + block.vertex(torch.cat([vertex, total], dim=1))
-        edge = edge + message
+        edge = 2 * edge if block.doubled else edge + message
     return net.decode(vertex)
 
 
@@ -59,7 +47,22 @@ def test_equals_the_textbook_with_all_gradients(
     monkeypatch, activation, hidden_layers, enveloped, frozen
 ):
     monkeypatch.setitem(edge_kernel.TILE, "cpu", 100)  # several tiles, the last one not full
-    net = network(activation, hidden_layers).requires_grad_(not frozen)
+    check_against_textbook(network(activation, hidden_layers), enveloped, frozen)
+
+
+@pytest.mark.parametrize("edge_update", ["residual", "doubled"])
+@pytest.mark.parametrize("hidden", [3, 13])
+@pytest.mark.parametrize("frozen", [True, False])
+def test_other_widths_and_doubled_edges_too(monkeypatch, edge_update, hidden, frozen):
+    monkeypatch.setitem(edge_kernel.TILE, "cpu", 100)
+    net = network(hidden=hidden, edge_update=edge_update, blocks=3)
+    check_against_textbook(net, True, frozen)
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)  # in plain operations
+    check_against_textbook(net, True, frozen)
+
+
+def check_against_textbook(net, enveloped, frozen):
+    net.requires_grad_(not frozen)
     vertex, edge, senders, receivers, weight = example()
     inputs = [t.requires_grad_() for t in (vertex, edge, weight)][: 3 if enveloped else 2]
     wanted = inputs + [p for p in net.parameters() if p.requires_grad]

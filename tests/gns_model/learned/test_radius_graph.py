@@ -13,7 +13,11 @@ RADIUS = 0.3
 
 
 def brute_force(
-    points: torch.Tensor, radius: float, batch: torch.Tensor | None = None
+    points: torch.Tensor,
+    radius: float,
+    batch: torch.Tensor | None = None,
+    *,
+    self_edges: bool = False,
 ) -> list[tuple[int, int]]:
     """Every pair, compared as the docstring says; (receiver, sender), sorted."""
     array = points.numpy()
@@ -21,7 +25,7 @@ def brute_force(
     for axis in range(array.shape[1]):
         squared += (array[:, None, axis] - array[None, :, axis]) ** 2
     close = squared < array.dtype.type(radius * radius)
-    np.fill_diagonal(close, False)
+    np.fill_diagonal(close, self_edges)
     if batch is not None:
         close &= batch.numpy()[:, None] == batch.numpy()[None, :]
     return [(int(i), int(j)) for i, j in zip(*np.nonzero(close), strict=True)]
@@ -42,14 +46,15 @@ def clouds(draw: st.DrawFn) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.from_numpy(points), torch.from_numpy(batch)
 
 
-@given(clouds(), st.booleans(), st.sampled_from([radius_graph, torch_radius_graph]))
-def test_equals_brute_force(cloud, batched, graph):
+@given(clouds(), st.booleans(), st.sampled_from([radius_graph, torch_radius_graph]), st.booleans())
+def test_equals_brute_force(cloud, batched, graph, self_edges):
     points, batch = cloud
     batch = batch if batched else None
-    senders, receivers = graph(points, RADIUS, batch)
+    senders, receivers = graph(points, RADIUS, batch, self_edges=self_edges)
     assert senders.dtype == receivers.dtype == torch.int64
     found = list(zip(receivers.tolist(), senders.tolist(), strict=True))
-    assert found == brute_force(points, RADIUS, batch)  # the order too
+    expected = brute_force(points, RADIUS, batch, self_edges=self_edges)
+    assert found == expected  # the order too
 
 
 def test_many_neighbours_are_not_capped():
