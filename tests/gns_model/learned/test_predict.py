@@ -50,7 +50,7 @@ def test_types_and_bounds_matter_and_stationary_points_are_answered_for(make_mod
     assert np.abs(moving - still).max() > 2e-5
     assert np.abs(still - history[:, -1]).max() > 1e-4
     wide = [(low - 1, high + 1) for low, high in BOUNDS]
-    assert np.abs(simulator.predict_positions(history, bounds=wide) - moving).max() > 1e-5
+    assert np.abs(simulator.predict_positions(history, bounds=wide) - moving).max() > 1e-6
 
 
 def test_a_scene_gives_what_arrays_do_not_tell(make_model, make_scene):
