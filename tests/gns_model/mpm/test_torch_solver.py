@@ -1,5 +1,7 @@
 """The torch solver is the numba solver: same motion, same statuses, alone or in a batch."""
 
+from dataclasses import is_dataclass, replace
+
 import numpy as np
 import pytest
 import torch
@@ -181,6 +183,31 @@ def test_nothing_that_a_scene_holds_reaches_its_neighbours(poison):
     for part in (batch.parts[0], batch.parts[2]):
         np.testing.assert_allclose(state.position[part].numpy(), alone[0], rtol=0, atol=1e-12)
     assert not (state.velocity[batch.parts[1]].abs() < problems[1].limit).all()
+
+
+def without_values(part):
+    """The same tensors on the meta device, which has shapes and no values."""
+    if isinstance(part, torch.Tensor):
+        return part.to("meta")
+    if is_dataclass(part):
+        fields = {key: without_values(value) for key, value in vars(part).items()}
+        return replace(part, **fields)
+    if isinstance(part, (list, tuple)):
+        return type(part)(without_values(value) for value in part)
+    return part
+
+
+@pytest.mark.parametrize("scene", [BLOCK, FLYING], ids=["3d", "2d"])
+def test_a_substep_never_waits_for_a_value_and_makes_nothing_on_another_device(scene):
+    """What a GPU needs: on the meta device either one is an error."""
+    problems = [posed(scene)]
+    state, batch = State.start(problems, CPU), Batch.of(problems, CPU)
+    state, batch = without_values(state), without_values(batch)
+    with torch.no_grad():
+        advance(state, batch)
+    assert state.position.is_meta
+    with pytest.raises((RuntimeError, NotImplementedError)):
+        float(state.position.sum())
 
 
 def test_an_interrupt_passes_through():
