@@ -65,10 +65,16 @@ def _check_fits(model: ModelConfig, source: Source) -> None:
         )
     if model.baffles == "none" and source.scene.baffles:
         raise RecipeError(f'{source.path}: has baffles, but model.baffles = "none" sees none')
+    unknown = {"base_friction"} | ({"tan_friction_angle"} if source.tan_friction is None else set())
+    if source.foreign and unknown & set(model.material_features):
+        raise RecipeError(
+            f"{source.path}: nothing is known of its {min(unknown & set(model.material_features))}, "
+            "which model.material_features asks for"
+        )
 
 
 #: What of a model's configuration the weights do not depend on: it may change on the way.
-FREE = {"noise_std", "subcells"}
+FREE = {"noise_std", "subcells", "bounds"}
 
 
 def check_resumable(recipe: Recipe, position: Position) -> None:
@@ -78,7 +84,9 @@ def check_resumable(recipe: Recipe, position: Position) -> None:
         RecipeError: naming the first key that differs.
     """
     wanted = {**recipe.model.model_dump(mode="json", exclude=FREE), "seed": recipe.seed}
-    found = {**position.architecture, "seed": position.seed}
+    # A state that is older than an option was trained with its default.
+    found = {**ModelConfig().model_dump(mode="json"), **position.architecture}
+    found["seed"] = position.seed
     for key in wanted:
         if wanted[key] != found.get(key):
             raise RecipeError(

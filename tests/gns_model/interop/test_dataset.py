@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from gns_model.data.windows import WindowIndex
-from gns_model.errors import FileFormatError
+from gns_model.errors import FileFormatError, GnsError
 from gns_model.interop.dataset import import_dataset, read_dataset
 from gns_model.interop.export import export_dataset
 from gns_model.interop.releases import point_spacing
@@ -19,6 +19,8 @@ from gns_model.learned import Limits
 from gns_model.measures import summary
 from gns_model.particles import MOVING, fill
 from gns_model.scene import Scene
+from gns_model.training.recipe import Recipe
+from gns_model.training.setup import open_data
 from gns_model.trajectory import Trajectory
 
 from .geoelements import metadata
@@ -275,6 +277,20 @@ def test_windows_of_an_imported_dataset(tmp_path):
         WindowIndex([tmp_path / "out"], **{**options, "spacing": 0.04})
     with pytest.raises(FileFormatError, match=r"9 frames are too few, 4 steps .* need 10"):
         WindowIndex([tmp_path / "out"], **options, unroll=4)
+
+
+def test_a_feature_that_nobody_knows_is_not_trained_on(tmp_path):
+    np.savez(tmp_path / "t.npz", a=pair(POSITIONS, KINDS))
+    import_dataset(tmp_path / "t.npz", about(tmp_path), tmp_path / "data")
+    model = {
+        "dim": 2, "spacing": 0.02, "radius": 0.05, "dt": 0.0025, "baffles": "points", "types": 9,
+        "material_features": ["tan_friction_angle"],
+    }  # fmt: skip
+    values = {"train": [str(tmp_path / "data")], "steps": 1, "mirror": False, "model": model}
+    with pytest.raises(GnsError, match="nothing is known of its tan_friction_angle"):
+        open_data(Recipe.from_dict(values), (str(tmp_path / "data"),))
+    model["material_features"] = []
+    assert open_data(Recipe.from_dict(values), (str(tmp_path / "data"),)).dim == 2
 
 
 # -- out -----------------------------------------------------------------------------------------
