@@ -10,15 +10,14 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gns_model.data.windows import WindowIndex
 from gns_model.learned.checkpoint import save_model
 from gns_model.learned.model import LearnedModel
 from gns_model.scene import write_whole
 from gns_model.training import batches
 from gns_model.training.claim import TrainingError, claim, tidy
 from gns_model.training.distributed import RankError, Ranks, session
+from gns_model.training.feeding import Feeder
 from gns_model.training.heap import release_heap
-from gns_model.training.kinematic import kinematic_spacing
 from gns_model.training.launching import end_with_launcher
 from gns_model.training.loss import unrolled_loss
 from gns_model.training.progress import Display
@@ -141,12 +140,14 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: Stop) ->
                 + f", {ranks.world} rank(s)"
                 + (f", resumed at step {position.step}" if position.step else "")
             )
+        on_gpu = ranks.device.type == "cuda"
+        feeder = Feeder(data, recipe, position.statistics, ranks, ahead=on_gpu)
         try:
             while (done := position.step if recipe.steps else position.seconds) < budget:
                 began = time.perf_counter()
                 progress = done / budget
                 with stop.may_abandon():
-                    loss, edges = _forward_and_backward(run, recipe, data, ranks, progress)
+                    loss, edges = _forward_and_backward(run, recipe, feeder, ranks, progress)
                 rate = learning_rate(recipe, position.step, progress)
 
                 # One message carries the gradients and all that the ranks have to agree on.
@@ -206,9 +207,11 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: Stop) ->
         except RankError:
             # The step in progress is lost and all before it are not. A rank that was told to
             # stop may leave in the middle of a step; any other ends the run.
-            save_all()
             if not stop.requested:
+                save_all()
                 raise
+        finally:
+            feeder.close()
         save_all()
         display.say(
             f"{'stopped' if stop.requested else 'finished'} at step {position.step} after "
@@ -219,33 +222,18 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: Stop) ->
 
 
 def _forward_and_backward(
-    run: Run, recipe: Recipe, data: WindowIndex, ranks: Ranks, progress: float
+    run: Run, recipe: Recipe, feeder: Feeder, ranks: Ranks, progress: float
 ) -> tuple[Tensor, float]:
     """Loss of this rank's windows of the next step, with its gradients in the parameters.
 
     Returns:
         the loss, a scalar, and the number of edges.
     """
-    step, config = run.position.step, run.model.config
-    steps = 1
-    if progress >= 1 - recipe.unroll_fraction and recipe.unroll > 1:
-        rng = batches.generator(recipe.seed, batches.UNROLL, step)
-        steps = int(rng.integers(1, recipe.unroll + 1))
-    drawn = batches.draw(
-        data,
-        batches.generator(recipe.seed, batches.DRAW, step),
-        ranks=ranks.world,
-        edges_per_batch=recipe.edges_per_batch,
-        statistics=run.position.statistics,
-        mirror=recipe.mirror,
-        early=recipe.early,
-        early_steps=recipe.early_steps,
-        unroll=steps,
-    )[ranks.rank]
-    kinematic = kinematic_spacing(config)
+    step = run.position.step
+    windows, edges = feeder.take(step, progress)
     batch = batches.collate(
-        [batches.read(data, item, unroll=steps, kinematic=kinematic) for item in drawn],
-        noise_std=config.noise_std,
+        windows,
+        noise_std=run.model.config.noise_std,
         rng=batches.generator(recipe.seed, batches.NOISE, step, ranks.rank),
         device=ranks.device,
     )
@@ -254,14 +242,14 @@ def _forward_and_backward(
         loss = unrolled_loss(
             run.model,
             batch,
-            steps=steps,
+            steps=feeder.unroll(step, progress),
             backprop=recipe.backprop_through_unroll,
             linear_beyond=recipe.linear_beyond,
             momentum_weight=recipe.momentum_weight,
         )
     run.optimiser.zero_grad(set_to_none=True)
     loss.backward()
-    return loss, sum(item.edges for item in drawn)
+    return loss, edges
 
 
 class _Clock:

@@ -65,11 +65,12 @@ def _check_fits(model: ModelConfig, source: Source) -> None:
         )
     if model.baffles == "none" and source.scene.baffles:
         raise RecipeError(f'{source.path}: has baffles, but model.baffles = "none" sees none')
-    unknown = {"base_friction"} | ({"tan_friction_angle"} if source.tan_friction is None else set())
-    if source.foreign and unknown & set(model.material_features):
+    known = {"tan_friction_angle"} if source.tan_friction is not None else set()
+    missing = sorted(set(model.material_features) - known)
+    if source.foreign and missing:
         raise RecipeError(
-            f"{source.path}: nothing is known of its {min(unknown & set(model.material_features))}, "
-            "which model.material_features asks for"
+            f"{source.path}: nothing is known of its {missing[0]}, which model.material_features "
+            "asks for"
         )
 
 

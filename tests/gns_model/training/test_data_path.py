@@ -11,8 +11,11 @@ from gns_model.learned.config import ModelConfig
 from gns_model.learned.graph import radius_graph
 from gns_model.learned.model import LearnedModel
 from gns_model.scene import Scene
+from gns_model.training import Recipe
 from gns_model.training.augment import mirror_positions, mirrored
 from gns_model.training.batches import DRAW, collate, draw, generator, read
+from gns_model.training.distributed import Ranks
+from gns_model.training.feeding import Feeder
 from gns_model.training.loss import step_error, unrolled_loss
 from gns_model.training.statistics import measure
 
@@ -168,6 +171,26 @@ def test_a_rank_gets_a_window_even_if_it_is_too_large(slides):
         mirror=False,
     )
     assert [len(part) for part in parts] == [1] * 4
+
+
+def test_windows_read_ahead_are_those_that_would_be_read(slides, tiny):
+    """Also where the next step is not the one that was expected."""
+    recipe = Recipe.from_dict(
+        {**tiny, "unroll": 3, "unroll_fraction": 0.5, "edges_per_batch": 3000}
+    )
+    windows, ranks = index(slides, unroll=3), Ranks(0, 2, torch.device("cpu"))
+    about = statistics(windows)
+    plain = Feeder(windows, recipe, about, ranks, ahead=False)
+    ahead = Feeder(windows, recipe, about, ranks, ahead=True)
+    for step, progress in ((0, 0.1), (1, 0.4), (2, 0.6), (3, 0.6), (7, 0.9), (8, 0.95)):
+        one, two = plain.take(step, progress), ahead.take(step, progress)
+        assert one[1] == two[1]
+        assert len(one[0]) == len(two[0]) > 1
+        for a, b in zip(one[0], two[0], strict=True):
+            np.testing.assert_array_equal(a.history, b.history)
+            np.testing.assert_array_equal(a.future, b.future)
+            assert a.future.shape[1] == plain.unroll(step, progress)
+    ahead.close()
 
 
 # -- loss ------------------------------------------------------------------------------------------

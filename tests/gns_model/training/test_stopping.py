@@ -131,7 +131,7 @@ def test_kill_9_at_random_moments_leaves_checkpoints_that_load(tiny, tmp_path, w
     steps = [int(word) for word in result.stdout.split()]
     assert len(steps) == 20
     assert steps == sorted(steps)  # no kill loses a state that was saved
-    assert steps[-1] > 20
+    assert steps[-1] >= 20
     # And training goes on from there, leaving none of the litter.
     finish = Recipe.from_dict({**tiny, "unroll": 1, "steps": steps[-1] + 2})
     train(finish, tmp_path / "run")
