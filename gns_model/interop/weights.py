@@ -304,7 +304,7 @@ def _config(
         history=HISTORY,
         self_edges=True,
         latent=sizes.latent,
-        hidden=sizes.hidden,
+        hidden=None if sizes.hidden == sizes.latent else sizes.hidden,
         hidden_layers=sizes.hidden_layers,
         blocks=sizes.blocks,
         activation="relu",
