@@ -22,6 +22,10 @@ Path = str | os.PathLike[str]
 
 #: Colours of the two that are compared, the same in every figure.
 OURS, LEARNED, PAPER = "0.25", "#c2571a", "#1f6f8b"
+#: Labels of axes.
+TIME, ASPECT = r"$t/\tau_c$", "aspect ratio $a = H_0/L_0$"
+RUNOUT = "normalised runout $(L_f - L_0)/L_0$"
+
 ENERGIES = {"potential": "#1f6f8b", "kinetic": "#c2571a", "dissipated": "#5a8f3c"}
 
 
@@ -49,8 +53,8 @@ def runout_by_aspect(rows: Sequence[Row], name: str, path: Path) -> None:
     ):
         left.plot(aspect, curve(rows, key), label=label, markersize=6, linewidth=1.3, **style)
     left.set(
-        xscale="log", yscale="log", xlabel="aspect ratio a = H₀ / L₀",
-        ylabel="normalised runout (L_f − L₀) / L₀",
+        xscale="log", yscale="log", xlabel=ASPECT,
+        ylabel=RUNOUT,
     )  # fmt: skip
     left.xaxis.set_major_locator(FixedLocator(list(aspect)))
     left.yaxis.set_major_locator(FixedLocator([0.5, 1, 2, 3, 4, 6, 8]))
@@ -67,8 +71,11 @@ def runout_by_aspect(rows: Sequence[Row], name: str, path: Path) -> None:
     right.bar(place - 0.2, ours, 0.38, color=LEARNED, label=f"{name} against our MPM")
     right.bar(place + 0.2, theirs, 0.38, color=PAPER, alpha=0.6, label="paper's GNS, its MPM")
     right.set_xticks(place, [f"{a:g}" for a in aspect])
-    reach = 1.25 * max(100 * RUNOUT_AIM, np.abs(ours).max(), np.abs(theirs).max())
-    right.set(xlabel="aspect ratio a", ylabel="runout error [%]", ylim=(-reach, 1.45 * reach))
+    low = min(-100 * RUNOUT_AIM, ours.min(), theirs.min())
+    high = max(100 * RUNOUT_AIM, ours.max(), theirs.max())
+    room = 0.1 * (high - low)  # and three times that on top, for the legend
+    right.set(xlabel="aspect ratio $a$", ylabel="runout error [%]")
+    right.set_ylim(low - room, high + 3 * room)
     right.set_title(
         f"mean {np.abs(ours).mean():.1f}% (aim {100 * MEAN_RUNOUT_AIM:g}%), "
         f"largest {np.abs(ours).max():.1f}% (aim {100 * RUNOUT_AIM:g}%, grey)",
@@ -86,7 +93,7 @@ def evolution(curves: Sequence[Sequence[Row]], name: str, path: Path) -> None:
         top.set_title(f"a = {rows[0]['aspect']:g}")
         geometry_panel(top, rows, name, legend=rows is curves[-1])
         energy_panel(bottom, rows, curve(rows, "t_over_tau"), name, legend=rows is curves[-1])
-        bottom.set_xlabel("t / τ_c")
+        bottom.set_xlabel(TIME)
         if rows is not curves[0]:
             top.set_ylabel("")
             bottom.set_ylabel("")
@@ -99,7 +106,7 @@ def geometry_panel(axes: Axes, rows: Sequence[Row], name: str, *, legend: bool) 
     for key, colour in (("runout", LEARNED), ("height", PAPER)):
         axes.plot(time, curve(rows, f"{key}_mpm"), color=colour, linewidth=1.6)
         axes.plot(time, curve(rows, key), color=colour, linewidth=1.6, linestyle=(0, (3, 2)))
-    axes.set_ylabel("runout (L_t − L₀) / L₀,  height H_t / L₀")
+    axes.set_ylabel(r"runout $(L_t - L_0)/L_0$,  height $H_t/L_0$")
     tidy(axes)
     if legend:
         marks = [
@@ -117,10 +124,10 @@ def energy_panel(
     for key, colour in ENERGIES.items():
         axes.plot(time, curve(rows, f"{key}_mpm"), color=colour, linewidth=1.6)
         axes.plot(time, curve(rows, key), color=colour, linewidth=1.6, linestyle=(0, (3, 2)))
-    axes.set(ylabel="energy / E₀", ylim=(min(-0.02, axes.get_ylim()[0]), 1.05))
+    axes.set(ylabel=r"energy / $E_0$", ylim=(min(-0.02, axes.get_ylim()[0]), 1.05))
     tidy(axes)
     if legend:
-        labels = {"potential": "E_p", "kinetic": "E_k", "dissipated": "E_d"}
+        labels = {"potential": "$E_p$", "kinetic": "$E_k$", "dissipated": "$E_d$"}
         marks = [Line2D([], [], color=ENERGIES[k], label=labels[k]) for k in ENERGIES]
         axes.legend(handles=[*marks, *_who(name)], frameon=False, fontsize=9)
 
@@ -180,12 +187,12 @@ def upscaled(
     )  # fmt: skip
     d.add_collection(lines)
     d.set(xlim=(0, time[-1]), ylim=(0, 1.05 * errors.max() or 1e-12))
-    d.set(xlabel="t / τ_c", ylabel="squared position error of a point [m²]")
+    d.set(xlabel=TIME, ylabel="squared position error of a point [m²]")
     d.ticklabel_format(axis="y", scilimits=(-2, 2))
     tidy(d)
     figure.colorbar(lines, ax=d, label="final displacement [m]")
     for axes in (a, b):
-        axes.set_xlabel("t / τ_c")
+        axes.set_xlabel(TIME)
     save_figure(figure, path)
 
 
@@ -194,7 +201,7 @@ def runout_by_friction(rows: Sequence[Row], name: str, path: Path) -> None:
     figure = Figure(figsize=(10.5, 4.4), layout="constrained")
     panels = (
         ("friction_angle", "aspect", "friction angle φ [°]", "a = {:g}"),
-        ("aspect", "friction_angle", "aspect ratio a = H₀ / L₀", "φ = {:g}°"),
+        ("aspect", "friction_angle", ASPECT, "φ = {:g}°"),
     )
     for axes, (along, each, label, form) in zip(figure.subplots(1, 2), panels, strict=True):
         values = sorted({row[each] for row in rows})
@@ -212,6 +219,6 @@ def runout_by_friction(rows: Sequence[Row], name: str, path: Path) -> None:
             for value, colour in zip(values, colours, strict=True)
         ]
         axes.legend(handles=[*marks, *_who(name)], frameon=False, fontsize=9)
-        axes.set(xlabel=label, ylabel="normalised runout (L_f − L₀) / L₀", ylim=(0, None))
+        axes.set(xlabel=label, ylabel=RUNOUT, ylim=(0, None))
         tidy(axes)
     save_figure(figure, path)

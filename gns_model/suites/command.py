@@ -123,9 +123,8 @@ def _by_suites(
     for name in report["left_out"].keys() - left_out.keys():
         print(f"left out: {name}: {report['left_out'][name]}", file=sys.stderr)
     for result in results:
-        for note in result.notes:
-            if note.startswith("Warning: "):
-                print(note.replace("Warning", "warning", 1), file=sys.stderr)
+        for warning in result.warnings:
+            print(f"warning: {warning}", file=sys.stderr)
     if as_json:
         print(json.dumps(report, indent=2))
         return
@@ -152,10 +151,7 @@ def _show(result: SuiteResult) -> None:
         print(aim)
     for key, value in result.facts.items():
         print(f"  {key}: {value:.4g}" if isinstance(value, float) else f"  {key}: {value}")
-    for note in result.notes:
-        if not note.startswith("Warning: "):
-            print(note)
-    print()
+    print("\n".join([*result.notes, ""]))
 
 
 def _on_data(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import statistics
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,8 +11,9 @@ from pathlib import Path
 
 import torch
 
-#: Repeats of which the median counts, and the least time that one should last [s].
-REPEATS, LEAST_SECONDS = 3, 1.0
+#: Repeats of which the least counts, the least time that one should last [s], and the share of
+#: what is left of the budget that they may take.
+REPEATS, LEAST_SECONDS, REPEAT_SHARE = 3, 0.5, 0.1
 #: Most steps in one repeat.
 MOST_STEPS = 20
 #: Share of the free memory of a CPU that an estimate may ask for.
@@ -29,6 +29,16 @@ class Cost:
     seconds: float | None = None  #: a step [s]
     memory: float | None = None  #: at its peak [bytes]
     reason: str = ""
+
+    @property
+    def megabytes(self) -> float | None:
+        """`memory` [MiB]."""
+        return None if self.memory is None else self.memory / 2**20
+
+
+def ratio(other: Cost, ours: Cost) -> float | None:
+    """How many times the seconds of `ours` another takes; None if one of them is not known."""
+    return other.seconds / ours.seconds if other.seconds and ours.seconds else None
 
 
 @dataclass
@@ -89,50 +99,67 @@ def free_memory() -> float | None:
     return _kilobytes(Path("/proc/meminfo"), "MemAvailable")
 
 
+def clock(device: str, threads: int) -> tuple[str, Callable[[], float]]:
+    """What seconds are counted by, by name: "CPU" where one thread of the CPU does the work.
+
+    CPU seconds are those of the wall on an idle machine and stay true on a busy one.
+    """
+    if device == "cpu" and threads == 1:
+        return "CPU", time.process_time
+    return "wall", time.perf_counter
+
+
 class Meter:
     """Measures one kind of work over growing sizes, as long as budget and memory hold.
 
     Args:
         device: torch device that the work runs on.
+        now: returns seconds, see `clock`.
     """
 
-    def __init__(self, device: str) -> None:
+    def __init__(self, device: str, now: Callable[[], float]) -> None:
         self.device = device
+        self.now = now
         self._last: tuple[float, Cost] | None = None  # size and cost of the largest so far
 
-    def measure(self, run: Callable[[int], float], size: float, budget: float) -> Cost:
-        """The cost of a step of `run`.
+    def measure(self, run: Callable[[int], object], size: float, budget: float) -> Cost:
+        """The cost of a step of `run`: the least of a few repeats, as noise only ever adds.
+
+        The first size is measured in any case, after one step that does not count: it compiles
+        and loads.
 
         Args:
-            run: does so many steps and returns the seconds of one.
+            run: does so many steps and waits for their end.
             size: what the cost is about proportional to, such as the number of edges.
             budget: seconds that may be spent here.
         """
         if (reason := self._too_much(size, budget)) is not None:
             return Cost(reason=reason)
-        began = time.perf_counter()
         try:
             if self._last is None:
-                run(1)  # compiles, loads libraries
+                run(1)
+            began = self.now()
             with peak_memory(self.device) as peak:
-                first = run(1)
-            steps = max(1, min(MOST_STEPS, int(LEAST_SECONDS / max(first, 1e-9))))
-            values: list[float] = []
+                run(1)
+            values = [self.now() - began]
+            steps = max(1, min(MOST_STEPS, int(LEAST_SECONDS / max(values[0], 1e-9))))
             for _ in range(REPEATS):
-                if values and time.perf_counter() - began + steps * first > budget:
-                    break
-                values.append(run(steps))
+                if self.now() - began + steps * values[0] > REPEAT_SHARE * budget:
+                    break  # larger sizes need the time more
+                start = self.now()
+                run(steps)
+                values.append((self.now() - start) / steps)
         except (torch.OutOfMemoryError, MemoryError):
             if self.device == "cuda":
                 torch.cuda.empty_cache()
             return Cost(reason="exceeds memory")
-        cost = Cost(statistics.median(values), peak.bytes)
+        cost = Cost(min(values), peak.bytes)
         self._last = size, cost
         return cost
 
     def _too_much(self, size: float, budget: float) -> str | None:
         if self._last is None:
-            return None if budget > 0 else "exceeds the time budget"
+            return None
         before, cost = self._last
         growth = size / before
         if cost.seconds is not None and 2 * growth * cost.seconds > budget:

@@ -54,7 +54,8 @@ def speed(rows: Sequence[Row], path: Path) -> None:
             axes.set(xscale="log", yscale="log")
             axes.margins(x=0.12, y=0.15)
             tidy(axes)
-            axes.legend(frameon=False, fontsize=8)
+            if axes.lines:
+                axes.legend(frameon=False, fontsize=8)
     save_figure(figure, path)
 
 

@@ -32,7 +32,7 @@ def evolution(rows: Sequence[Row], pair: Pair, name: str, path: Path) -> None:
     deep.set(ylabel="depth upstream of a row [m]", ylim=(0, 1.15 * top))
     energy_panel(energy, rows, curve(rows, "time"), name, legend=True)
     _lines(held, rows, {"held_back": "upstream minus downstream"}, name)
-    held.set(ylabel="(E_p + E_k) / E₀ held back by the baffles")
+    held.set(ylabel=r"$(E_p + E_k)/E_0$ held back by the baffles")
     for axes in (energy, held):
         axes.set_xlabel("t [s]")
     save_figure(figure, path)

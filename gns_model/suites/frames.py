@@ -5,10 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Rectangle
 
 from gns_model import measures
@@ -19,6 +22,8 @@ from gns_model.trajectory import Trajectory
 
 Path = str | os.PathLike[str]
 
+#: Colours of heights: without the palest, which would not show on white.
+HEIGHTS = ListedColormap(matplotlib.colormaps["YlOrBr"](np.linspace(0.15, 1, 256)))
 #: Normalised times at which the paper shows a collapse; the last frame follows.
 TIMES = (0.0, 1.0, 1.5, 2.5)
 
@@ -34,7 +39,7 @@ def collapse(pair: Pair, name: str, path: Path) -> None:
     tau = critical_time(pair.reference)
     end = float(pair.predicted.time[-1])
     times = [t * tau for t in TIMES if t * tau < end] + [end]
-    _side_views([(f"t / τ_c = {t / tau:.1f}", pair, t) for t in times], name, path)
+    _side_views([(rf"$t/\tau_c$ = {t / tau:.1f}", pair, t) for t in times], name, path)
 
 
 def _side_views(rows: Sequence[tuple[str, Pair, float]], name: str, path: Path) -> None:
@@ -49,7 +54,8 @@ def _side_views(rows: Sequence[tuple[str, Pair, float]], name: str, path: Path) 
     width = 1.06 * max(float(t.positions[k, :, 0].max()) for row in views for t, k in row) - wall
     height = 1.1 * max(float(t.positions[k, :, 1].max()) for row in views for t, k in row) - base
     figure = Figure(
-        figsize=(10.5, (4.9 * height / width + 0.12) * len(rows) + 1.1), layout="constrained"
+        figsize=(10.5, (4.9 * height / width + 0.12) * len(rows) + 1.1),
+        layout=ConstrainedLayoutEngine(h_pad=0.08),
     )
     grid = figure.subplots(len(rows), 2, squeeze=False, sharex=True, sharey=True)
     dots: PathCollection | None = None
@@ -72,7 +78,7 @@ def _side_views(rows: Sequence[tuple[str, Pair, float]], name: str, path: Path) 
     assert dots is not None
     figure.colorbar(
         dots, ax=grid.ravel().tolist(), label="displacement [m]", location="bottom", shrink=0.5,
-        aspect=40,
+        aspect=40, pad=0.02,
     )  # fmt: skip
     save_figure(figure, path)
 
@@ -87,7 +93,8 @@ def plan_views(pair: Pair, times: Sequence[float], name: str, path: Path) -> Non
     scene = pair.scene
     width, _, depth = scene.domain.size
     figure = Figure(
-        figsize=(2.75 * len(times) + 0.5, 2.75 * 2 * depth / width + 1.5), layout="constrained"
+        figsize=(2.75 * len(times) + 0.5, 2.75 * 2 * depth / width + 1.5),
+        layout=ConstrainedLayoutEngine(h_pad=0.08),
     )
     grid = figure.subplots(2, len(times), squeeze=False, sharex=True, sharey=True)
     top = 0.0
@@ -103,7 +110,7 @@ def plan_views(pair: Pair, times: Sequence[float], name: str, path: Path) -> Non
             share = 2.5 * 72 * trajectory.point_volume ** (1 / 3) / width
             dots = axes.scatter(
                 points[:, 0], points[:, 2], s=share**2, c=points[:, 1] - scene.base,
-                cmap="YlOrBr", vmin=-0.15 * top, vmax=1.1 * top, linewidths=0,
+                cmap=HEIGHTS, vmin=0.0, vmax=1.1 * top, linewidths=0,
             )  # fmt: skip
             _baffles(axes, scene.baffle_boxes())
             axes.set(

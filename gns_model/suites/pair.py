@@ -71,6 +71,21 @@ def simulate(simulator: Simulator, scenes: Sequence[Scene], setup: Setup) -> lis
     return [Pair(p, r) for p, r in zip(predicted, true, strict=True)]
 
 
+def outside(simulator: Simulator, scenes: Sequence[Scene]) -> list[str]:
+    """A sentence for every limit of the simulator's training that a scene passes, none repeated."""
+    limits = getattr(getattr(simulator, "config", None), "limits", None)
+    if limits is None:
+        return []
+    first: dict[str, str] = {}
+    for scene in scenes:
+        for line in limits.broken_by(scene):
+            first.setdefault(line, scene.name)
+    return [
+        f"scene {name!r} is outside what {simulator.name} was trained on: {line}"
+        for line, name in first.items()
+    ]
+
+
 def relative(value: float, true: float) -> float:
     """Signed error of `value` in shares of `true` [-]; nan if that is 0."""
     return (value - true) / abs(true) if true else math.nan

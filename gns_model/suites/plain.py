@@ -44,7 +44,7 @@ class PlainNetwork(nn.Module):
             weighted = message if envelope is None else message * envelope
             total = torch.zeros_like(vertex).index_add(0, receivers, weighted)
             vertex = vertex + block.vertex(torch.cat([vertex, total], dim=1))
-            edge = edge + message
+            edge = edge + (edge if block.doubled else message)
         return net.decode(vertex)
 
 

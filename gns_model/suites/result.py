@@ -48,6 +48,7 @@ class SuiteResult:
         shown: (key, heading, format) of the columns that a terminal shows.
         aims: what was aimed at.
         facts: single numbers that belong to no row.
+        warnings: what the model was not trained for.
         notes: sentences that a reader needs to understand the numbers.
         curves: longer tables, by file name without ending.
         files: names of the files that were written into the folder.
@@ -60,6 +61,7 @@ class SuiteResult:
     shown: Sequence[tuple[str, str, str]]
     aims: list[Aim] = field(default_factory=list)
     facts: Row = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     curves: dict[str, list[Row]] = field(default_factory=dict)
     files: list[str] = field(default_factory=list)
@@ -72,6 +74,7 @@ class SuiteResult:
             "rows": self.rows,
             "aims": [aim.to_dict() for aim in self.aims],
             "facts": self.facts,
+            "warnings": self.warnings,
             "notes": self.notes,
             "files": self.files,
             "seconds": self.seconds,

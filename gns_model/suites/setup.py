@@ -46,4 +46,7 @@ def dimension(simulator: Simulator) -> int | None:
 def stride(simulator: Simulator) -> float:
     """Time between the frames of its trajectories [s]."""
     config = getattr(simulator, "config", None)
-    return float(getattr(config, "dt", getattr(simulator, "frame_interval", DEFAULT_STRIDE)))
+    if config is not None:
+        return float(config.dt)
+    settings = simulator.settings() if hasattr(simulator, "settings") else {}
+    return float(settings.get("frame_interval", DEFAULT_STRIDE))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from gns_model.scene import Scene
 from gns_model.simulator import Progress, Simulator
 from gns_model.suites import cost_figures
 from gns_model.suites.block import block_scene
-from gns_model.suites.cost import Cost, Meter
+from gns_model.suites.cost import Cost, Meter, clock, ratio
 from gns_model.suites.plain import plain
 from gns_model.suites.result import Row, SuiteResult
 from gns_model.suites.setup import Setup, dimension
@@ -58,7 +57,7 @@ SHOWN = (
     ("seconds_plain", "plain", ".4f"),
     ("seconds_mpm", "our MPM", ".4f"),
     ("over_plain", "plain / ours", ".1f"),
-    ("bfloat16_over_plain", "plain / bf16", ".1f"),
+    ("bfloat16_over_plain", "plain / bfloat16", ".1f"),
     ("over_mpm", "MPM / ours", ".1f"),
     ("memory_mb", "MB", ",.0f"),
     ("memory_plain_mb", "plain MB", ",.0f"),
@@ -95,12 +94,13 @@ def run(simulator: Simulator, setup: Setup) -> SuiteResult:
         suite="speed",
         title=f"Seconds per rollout step, {setup.threads} thread(s) on the CPU",
         rows=rows,
-        shown=SHOWN,
+        shown=[s for s in SHOWN if s[0] != "device" or len(setup.devices) > 1],
         notes=[
             "Same process, same points, same graph; plain is cat-gather-scatter in float32 with "
             "the same weights. Our MPM advances the same points by the same time on "
             f"{setup.threads} thread(s) of the CPU. Edges are directed. Memory: on a CPU above "
-            "what was resident before the step, on CUDA all that torch had allocated.",
+            "what was resident before the step, on CUDA all that torch had allocated. One thread's "
+            "seconds are CPU seconds.",
             "The paper's columns are its own machines': its MPM is CB-Geo on 56 cores, its GNS on "
             "those and on an A100 of 40 GB.",
         ],
@@ -137,8 +137,12 @@ def _ladder(
             spacing=config.spacing, frame_interval=config.dt, threads=setup.threads
         ),
     }
-    meters = {kind: Meter("cpu" if kind == "_mpm" else device) for kind in KINDS}
-    ends = time.perf_counter() + budget
+    meters, counted = {}, {}
+    for kind in KINDS:
+        where = "cpu" if kind == "_mpm" else device
+        counted[kind], now = clock(where, setup.threads)
+        meters[kind] = Meter(where, now)
+    spent = 0.0
     rows = []
     sizes = SIZES[config.dim]
     for number, points in enumerate(sizes):
@@ -147,22 +151,37 @@ def _ladder(
         edges = len(radius_graph(torch.tensor(start, dtype=torch.float32), config.radius)[0])
         costs: dict[str, Cost] = {}
         for place, kind in enumerate(KINDS):
-            left = ends - time.perf_counter()
-            costs[kind] = meters[kind].measure(
-                _steps_of(runners[kind], scene, config.dt), len(start), left
-            )
+            began = meters[kind].now()
+            steps = _steps_of(runners[kind], scene, config.dt)
+            costs[kind] = meters[kind].measure(steps, len(start), budget - spent)
+            spent += meters[kind].now() - began
             progress((number + (place + 1) / len(KINDS)) / len(sizes))
-        rows.append(_row(series, device, setup.threads, points, len(start), edges, costs))
+        rows.append(
+            {
+                "network": series.name,
+                "dim": config.dim,
+                "device": device,
+                "threads": setup.threads,
+                "counted": counted[""],
+                "points": len(start),
+                "edges": edges,
+                "latent": config.latent,
+                "blocks": config.blocks,
+                "dt": config.dt,
+                **_columns(costs),
+                **_told(config.dim, points if series.paper else None),
+            }
+        )
         if all(cost.seconds is None for cost in costs.values()):
             break
     progress(1.0)
     return rows
 
 
-def _steps_of(runner: Simulator, scene: Scene, dt: float) -> Callable[[int], float]:
-    """A function that runs so many steps of dt [s] and returns the seconds that one took."""
+def _steps_of(runner: Simulator, scene: Scene, dt: float) -> Callable[[int], None]:
+    """A function that runs so many steps of dt [s]."""
 
-    def steps(count: int) -> float:
+    def steps(count: int) -> None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a block of this size is outside any model's limits
             trajectory = runner.rollout([scene.replace(duration=count * dt)])[0]
@@ -171,50 +190,24 @@ def _steps_of(runner: Simulator, scene: Scene, dt: float) -> Callable[[int], flo
                 f"{runner.name} {trajectory.status} on a block of {len(trajectory.particle_type)} "
                 "points: its time means nothing"
             )
-        return float(trajectory.settings["seconds"]) / count
 
     return steps
 
 
-def _row(
-    series: Series,
-    device: str,
-    threads: int,
-    nominal: int,
-    points: int,
-    edges: int,
-    costs: dict[str, Cost],
-) -> Row:
-    config = series.model.config
-    row: Row = {
-        "network": series.name,
-        "dim": config.dim,
-        "device": device,
-        "threads": threads,
-        "points": points,
-        "edges": edges,
-        "latent": config.latent,
-        "blocks": config.blocks,
-        "dt": config.dt,
-    }
-    for kind in KINDS:
-        row[f"seconds{kind}"] = costs[kind].seconds
-    row["over_plain"] = _ratio(costs["_plain"], costs[""])
-    row["bfloat16_over_plain"] = _ratio(costs["_plain"], costs["_bfloat16"])
-    row["over_mpm"] = _ratio(costs["_mpm"], costs[""])
-    for kind in KINDS:
-        memory = costs[kind].memory
-        row[f"memory{kind}_mb"] = None if memory is None else memory / 2**20
-    told = PAPER[config.dim].get(nominal) if series.paper else None
-    keys = ("paper_edges", "paper_mpm", "paper_cpu", "paper_gpu")
-    row |= dict(zip(keys, told or (None,) * 4, strict=True))
+def _columns(costs: dict[str, Cost]) -> Row:
+    """Seconds, ratios and memory of one size, and why there is none of them where there is none."""
+    row: Row = {f"seconds{kind}": costs[kind].seconds for kind in KINDS}
+    row["over_plain"] = ratio(costs["_plain"], costs[""])
+    row["bfloat16_over_plain"] = ratio(costs["_plain"], costs["_bfloat16"])
+    row["over_mpm"] = ratio(costs["_mpm"], costs[""])
+    row |= {f"memory{kind}_mb": costs[kind].megabytes for kind in KINDS}
     row["left_out"] = "; ".join(
         f"{kind[1:] or 'ours'}: {cost.reason}" for kind, cost in costs.items() if cost.reason
     )
     return row
 
 
-def _ratio(other: Cost, ours: Cost) -> float | None:
-    if other.seconds is None or not ours.seconds:
-        return None
-    return other.seconds / ours.seconds
+def _told(dim: int, points: int | None) -> Row:
+    """What the paper's table says of a size, if it has it."""
+    keys = ("paper_edges", "paper_mpm", "paper_cpu", "paper_gpu")
+    return dict(zip(keys, PAPER[dim].get(points or 0, (None,) * 4), strict=True))

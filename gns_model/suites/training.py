@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-import time
+import math
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from gns_model.particles import fill
 from gns_model.simulator import Simulator
 from gns_model.suites import cost_figures
 from gns_model.suites.block import block_scene
-from gns_model.suites.cost import Cost, Meter
+from gns_model.suites.cost import Cost, Meter, clock, ratio
 from gns_model.suites.plain import plain
 from gns_model.suites.result import Row, SuiteResult
 from gns_model.suites.setup import Setup
@@ -128,17 +128,17 @@ def block_batch(config: ModelConfig, edges: int, device: str, graphs: int = GRAP
 
 
 def stepper(model: LearnedModel, batch: Batch, *, short: bool) -> Callable[[int], float]:
-    """A function that takes so many training steps and returns the seconds that one took.
+    """A function that takes so many training steps and returns the loss before the last.
 
     Args:
         short: products in bfloat16, as the recipes' precision = "bfloat16".
     """
     model = copy.deepcopy(model).train().requires_grad_(True)
     device = batch.history.device.type
-    optimiser = torch.optim.AdamW(model.parameters(), lr=1e-6)
+    optimiser = torch.optim.AdamW(model.parameters(), lr=1e-4)
 
     def steps(count: int) -> float:
-        began = time.perf_counter()
+        value = math.nan
         for _ in range(count):
             with torch.autocast(device, torch.bfloat16) if short else nullcontext():
                 loss = unrolled_loss(model, batch)
@@ -146,8 +146,8 @@ def stepper(model: LearnedModel, batch: Batch, *, short: bool) -> Callable[[int]
             loss.backward()
             torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
             optimiser.step()
-            loss.item()  # waits for a GPU
-        return (time.perf_counter() - began) / count
+            value = loss.item()  # waits for a GPU
+        return value
 
     return steps
 
@@ -159,12 +159,13 @@ def _row(setting: Setting, device: str, setup: Setup, budget: float) -> Row:
     edges = len(radius_graph(batch.history[:, -1], config.radius, batch.world.batch)[0])
     networks = {"": model, "_bfloat16": model, "_plain": plain(model)}
     costs: dict[str, Cost] = {}
+    counted, now = clock(device, setup.threads)
     threads = torch.get_num_threads()
     torch.set_num_threads(setup.threads)
     try:
         for kind in KINDS:
             steps = stepper(networks[kind], batch, short=kind == "_bfloat16")
-            costs[kind] = Meter(device).measure(steps, edges, budget / len(KINDS))
+            costs[kind] = Meter(device, now).measure(steps, edges, budget / len(KINDS))
     finally:
         torch.set_num_threads(threads)
     row: Row = {
@@ -172,19 +173,15 @@ def _row(setting: Setting, device: str, setup: Setup, budget: float) -> Row:
         "dim": config.dim,
         "device": device,
         "threads": setup.threads,
+        "counted": counted,
         "parameters": sum(p.numel() for p in setting.model.parameters()),
         "points": len(batch.history),
         "edges": edges,
     }
-    for kind in KINDS:
-        row[f"seconds{kind}"] = costs[kind].seconds
-    ours, plainly = costs[""].seconds, costs["_plain"].seconds
-    short = costs["_bfloat16"].seconds
-    row["over_plain"] = plainly / ours if plainly and ours else None
-    row["bfloat16_over_plain"] = plainly / short if plainly and short else None
-    for kind in KINDS:
-        memory = costs[kind].memory
-        row[f"memory{kind}_mb"] = None if memory is None else memory / 2**20
+    row |= {f"seconds{kind}": costs[kind].seconds for kind in KINDS}
+    row["over_plain"] = ratio(costs["_plain"], costs[""])
+    row["bfloat16_over_plain"] = ratio(costs["_plain"], costs["_bfloat16"])
+    row |= {f"memory{kind}_mb": costs[kind].megabytes for kind in KINDS}
     told = PAPER[config.dim] if setting.paper else (None,) * 4
     keys = ("paper_edges", "paper_parameters", "paper_memory_gb", "paper_seconds")
     return {**row, **dict(zip(keys, told, strict=True))}

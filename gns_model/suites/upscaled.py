@@ -6,7 +6,7 @@ from gns_model import paper
 from gns_model.simulator import Simulator
 from gns_model.suites import column_figures, frames
 from gns_model.suites.collapse import collapse_curves, collapse_row, paper_columns
-from gns_model.suites.pair import simulate, squared_errors
+from gns_model.suites.pair import outside, simulate, squared_errors
 from gns_model.suites.result import Aim, Row, SuiteResult
 from gns_model.suites.setup import Setup
 
@@ -67,6 +67,7 @@ def run(simulator: Simulator, setup: Setup) -> SuiteResult:
         suite="upscaled",
         title=f"The up-scaled column: {name} beside our MPM and the paper",
         rows=rows,
+        warnings=outside(simulator, scenes),
         shown=SHOWN,
         aims=[Aim("runout error, up-scaled", error, RUNOUT_AIM)],
         facts={"mass_ratio": large.height * large.length / (small.height * small.length)},
