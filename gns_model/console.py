@@ -59,26 +59,35 @@ def main(app: Typer, name: str, arguments: list[str] | None = None) -> NoReturn:
     A SIGTERM (a batch system that ends the job) is treated as Ctrl-C, so that the same care is
     taken of what is half done.
     """
+    signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        with clean_errors():
+            code = _run(app, name, arguments)
+            if code == INTERRUPTED:  # typer swallows the interrupt and returns its code
+                raise KeyboardInterrupt
+    finally:
+        # Nothing is left to take care of: a signal that comes now must not become a traceback.
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    raise SystemExit(code if isinstance(code, int) else 0)
+
+
+def _run(app: Typer, name: str, arguments: list[str] | None) -> object:
+    """What `app` returns; bad options end here."""
     from typer import Abort
 
-    signal.signal(signal.SIGTERM, _interrupt)
-    with clean_errors():
-        try:
-            code = app(arguments, prog_name=name, standalone_mode=False)
-        except Abort:
-            raise KeyboardInterrupt from None
-        except Exception as error:
-            # click's and typer's usage errors, whose common base depends on typer's version.
-            if not hasattr(error, "format_message"):
-                raise
-            message = error.format_message()
-            if type(error).__name__ == "NoArgsIsHelpError":  # the message is the whole help
-                print(message, file=sys.stderr)
-                raise SystemExit(USER_ERROR) from None
-            fail(f"{message} (see {name} --help)")
-        if code == INTERRUPTED:  # typer swallows the interrupt and returns its code
-            raise KeyboardInterrupt
-    raise SystemExit(code if isinstance(code, int) else 0)
+    try:
+        return app(arguments, prog_name=name, standalone_mode=False)
+    except Abort:
+        raise KeyboardInterrupt from None
+    except Exception as error:
+        # click's and typer's usage errors, whose common base depends on typer's version.
+        if not hasattr(error, "format_message"):
+            raise
+        message = error.format_message()
+        if type(error).__name__ == "NoArgsIsHelpError":  # the message is the whole help
+            print(message, file=sys.stderr)
+            raise SystemExit(USER_ERROR) from None
+        fail(f"{message} (see {name} --help)")
 
 
 def _interrupt(signum: int, frame: object) -> NoReturn:
