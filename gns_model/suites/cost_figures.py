@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from gns_model.evaluation_figures import save_figure
 from gns_model.suites.column_figures import LEARNED, OURS, PAPER, tidy
@@ -22,41 +23,63 @@ KINDS = {
     "seconds_plain": ("plain network", {"color": PAPER, "marker": "^"}),
     "seconds_mpm": ("our MPM", {"color": OURS, "marker": "s"}),
 }
-TOLD = {
-    "paper_mpm": ("paper: MPM, 56 cores", {"color": "0.6", "marker": "s"}),
-    "paper_cpu": ("paper: GNS, CPU", {"color": "#5a8f3c", "marker": "D"}),
-    "paper_gpu": ("paper: GNS, A100", {"color": "#5a8f3c", "marker": "*"}),
-}
+#: Column of the paper's table, label and style.
+TOLD = (
+    (1, "paper: MPM, 56 cores", {"color": "0.6", "marker": "s"}),
+    (2, "paper: GNS, CPU", {"color": "#8fb573", "marker": "D"}),
+    (3, "paper: GNS, A100", {"color": "#5a8f3c", "marker": "*"}),
+)
+
+#: Points -> edges and the seconds of TOLD.
+Table = Mapping[int, tuple[float | None, ...]]
 
 
-def speed(rows: Sequence[Row], path: Path) -> None:
-    """Seconds per rollout step over points, one panel a network and device; edges below."""
+def speed(rows: Sequence[Row], told: Mapping[int, Table], path: Path) -> None:
+    """Seconds per rollout step over points, one panel a network and device; edges below.
+
+    Args:
+        told: the paper's table by dimension, drawn where the network is the paper's.
+    """
     panels = list(dict.fromkeys((row["network"], row["device"]) for row in rows))
-    figure = Figure(figsize=(4.6 * len(panels) + 0.4, 6.8), layout="constrained")
-    grid = figure.subplots(2, len(panels), squeeze=False, height_ratios=(1.7, 1), sharex="col")
+    figure = Figure(figsize=(4.6 * len(panels) + 0.4, 7.2), layout="constrained")
+    grid = figure.subplots(2, len(panels), squeeze=False, height_ratios=(1.9, 1), sharex="col")
     for (top, bottom), (network, device) in zip(grid.T, panels, strict=True):
         mine = [r for r in rows if (r["network"], r["device"]) == (network, device)]
-        for key, (label, style) in {**KINDS, **TOLD}.items():
-            points = [(r["points"], r[key]) for r in mine if r[key] is not None]
-            if points:
-                line = ":" if key in TOLD else "-"
-                top.plot(*zip(*points, strict=True), label=label, linestyle=line, **style)
-        top.set_title(f"{network}, {device}")
-        top.set_ylabel("seconds per step")
-        edges = [(r["points"], r["edges"]) for r in mine]
-        bottom.plot(*zip(*edges, strict=True), color=OURS, marker="o", label="ours")
-        told = [(r["points"], r["paper_edges"]) for r in mine if r["paper_edges"] is not None]
-        if told:
-            style = {"color": "#5a8f3c", "marker": "*", "linestyle": ":"}
-            bottom.plot(*zip(*told, strict=True), label="paper", **style)
+        table = told.get(mine[0]["dim"], {}) if mine[0]["of_paper"] else {}
+        for key, (label, style) in KINDS.items():
+            _line(top, [(r["points"], r[key]) for r in mine], label, "-", style)
+        for column, label, style in TOLD:
+            _line(top, [(n, values[column]) for n, values in table.items()], label, ":", style)
+        top.set(title=f"{network}, {device}", ylabel="seconds per step")
+        edges = {"color": OURS, "marker": "o"}
+        _line(bottom, [(r["points"], r["edges"]) for r in mine], "ours", "-", edges)
+        edges = {"color": "#5a8f3c", "marker": "*"}
+        _line(bottom, [(n, values[0]) for n, values in table.items()], "paper", ":", edges)
         bottom.set(xlabel="points", ylabel="edges")
         for axes in (top, bottom):
-            axes.set(xscale="log", yscale="log")
-            axes.margins(x=0.12, y=0.15)
-            tidy(axes)
+            _decades(axes)
             if axes.lines:
                 axes.legend(frameon=False, fontsize=8)
     save_figure(figure, path)
+
+
+def _line(
+    axes: Axes, points: Sequence[tuple[int, float | None]], label: str, line: str, style: Row
+) -> None:
+    known = [(x, y) for x, y in points if y is not None]
+    if known:
+        axes.plot(*zip(*known, strict=True), label=label, linestyle=line, **style)
+
+
+def _decades(axes: Axes) -> None:
+    """Logarithmic axes over whole decades, so that there are always ticks to read."""
+    axes.set(xscale="log", yscale="log")
+    for values, limit in ((0, axes.set_xlim), (1, axes.set_ylim)):
+        every = np.concatenate([np.asarray(line.get_data()[values], float) for line in axes.lines])
+        limit(10 ** np.floor(np.log10(every.min())), 10 ** np.ceil(np.log10(every.max() * 1.01)))
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_minor_formatter(NullFormatter())
+    tidy(axes)
 
 
 def training(rows: Sequence[Row], path: Path) -> None:
@@ -95,6 +118,7 @@ def _bars(
             fontsize=7,
         )  # fmt: skip
     axes.set_yscale("log")
+    axes.yaxis.set_minor_formatter(NullFormatter())
     axes.margins(y=0.25)
     ticks = [f"{r['network']}\n{r['edges'] / 1e3:.0f}K edges, {r['device']}" for r in rows]
     axes.set_xticks(place, ticks, fontsize=8)

@@ -89,7 +89,7 @@ def run(simulator: Simulator, setup: Setup) -> SuiteResult:
         for series in every:
             progress = setup.stage(f"speed of {series.name} on {device}")
             rows += _ladder(series, device, setup, setup.budget / len(every), progress)
-    cost_figures.speed(rows, setup.out / "speed.png")
+    cost_figures.speed(rows, PAPER, setup.out / "speed.png")
     return SuiteResult(
         suite="speed",
         title=f"Seconds per rollout step, {setup.threads} thread(s) on the CPU",
@@ -160,6 +160,7 @@ def _ladder(
             {
                 "network": series.name,
                 "dim": config.dim,
+                "of_paper": series.paper,
                 "device": device,
                 "threads": setup.threads,
                 "counted": counted[""],

@@ -15,6 +15,7 @@ from gns_model.learned import LearnedModel, ModelConfig
 from gns_model.learned.graph import radius_graph
 from gns_model.learned.world import World
 from gns_model.particles import fill
+from gns_model.scene import Scene
 from gns_model.simulator import Simulator
 from gns_model.suites import cost_figures
 from gns_model.suites.block import block_scene
@@ -107,13 +108,7 @@ def block_batch(config: ModelConfig, edges: int, device: str, graphs: int = GRAP
     What they do is random: only the cost of a step is of interest.
     """
     rng = np.random.default_rng(0)
-    points = edges / graphs / 10
-    for _ in range(4):  # the share of points at the surface falls as blocks grow
-        scene = block_scene(config.dim, round(points), config.spacing)
-        start = fill(scene, config.spacing).positions
-        start = start + rng.uniform(-0.2, 0.2, start.shape) * config.spacing
-        found = len(radius_graph(torch.tensor(start, dtype=torch.float32), config.radius)[0])
-        points = len(start) * edges / graphs / max(1, found)
+    start, scene = _block_with(config, edges / graphs, rng)
     velocity = np.array([1.0] + [0.0] * (config.dim - 1))
     past = np.arange(-config.history, 1)[:, None] * config.dt * velocity
     history = start[:, None] + past + rng.normal(0, 1e-4, (len(start), len(past), config.dim))
@@ -125,6 +120,22 @@ def block_batch(config: ModelConfig, edges: int, device: str, graphs: int = GRAP
 
     world = World.from_scenes([scene] * graphs, [len(start)] * graphs, device=device)
     return Batch(tensor(history), tensor(moves), world)
+
+
+def _block_with(
+    config: ModelConfig, edges: float, rng: np.random.Generator
+) -> tuple[np.ndarray, Scene]:
+    """Loose points (N, D) of a block with about `edges` edges, and the scene that they stand in."""
+    points, best = edges / 10, (math.inf, np.empty(0), block_scene(config.dim, 8, config.spacing))
+    for _ in range(6):  # the share of points at the surface falls as blocks grow
+        scene = block_scene(config.dim, round(points), config.spacing)
+        start = fill(scene, config.spacing).positions
+        start = start + rng.uniform(-0.2, 0.2, start.shape) * config.spacing
+        found = len(radius_graph(torch.tensor(start, dtype=torch.float32), config.radius)[0])
+        if abs(found - edges) < best[0]:
+            best = abs(found - edges), start, scene
+        points = len(start) * edges / max(1, found)
+    return best[1], best[2]
 
 
 def stepper(model: LearnedModel, batch: Batch, *, short: bool) -> Callable[[int], float]:
