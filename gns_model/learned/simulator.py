@@ -23,8 +23,8 @@ from gns_model.scene import Scene
 from gns_model.simulator import Progress
 from gns_model.trajectory import DIVERGED, OK, Trajectory
 
-#: Points in one batch. On a CPU more would only leave the caches: two flumes of 4,048 points at once
-#: cost 10% more than one after the other, four 20% (one thread). A GPU wants to be filled.
+#: Points in one batch. On a CPU more would only leave the caches: two flumes of 4,048 points at
+#: once cost 10% more than one after the other, four 20% (one thread). A GPU wants to be filled.
 BATCH_POINTS = {"cpu": 6_000, "cuda": 400_000}
 
 
