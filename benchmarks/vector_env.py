@@ -73,7 +73,8 @@ def main() -> None:
         name = torch.cuda.get_device_name() if device == "cuda" else f"{os.cpu_count()} cores"
         print(
             f"{arguments.simulator} on {device} ({name}), {n} flows of {arguments.duration:g} s, "
-            f"{arguments.threads} torch threads in this process"
+            f"{arguments.threads} torch threads in this process, "
+            f"load average {os.getloadavg()[0]:.1f} by others and us"
         )
         rows = [("single envs in turn", singles(device)), ("one batch", vector(device))]
         if device == "cpu" and arguments.workers > 1:

@@ -198,30 +198,41 @@ def coarse(args: argparse.Namespace) -> MpmSimulator:
 
 
 def learning_curve(
-    path: Path, curves: list[list[tuple[int, float]]], guesses: list[float], staggered: float
+    path: Path,
+    curves: list[list[tuple[int, float]]],
+    chosen: list[float],
+    guesses: list[float],
+    staggered: float,
 ) -> None:
     """Cost of the episodes against rollouts: the agents, the random agent, the paper's layout."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7.2, 3.9), dpi=150, layout="constrained")
+    figure = Figure(figsize=(7.2, 4.0), dpi=150, layout="constrained")
     axes = figure.add_subplot()
-    for k, episodes in enumerate(curves):
+    seeds = f" ({len(curves)} seeds)" if len(curves) > 1 else ""
+    for k, (episodes, final) in enumerate(zip(curves, chosen, strict=True)):
         at, cost = np.array(episodes).T
-        axes.plot(at, cost, ".", ms=2.5, color="#d08b3c", alpha=0.25, mew=0)
-        mean = np.convolve(cost, np.ones(32) / 32, "valid")
-        label = "PPO, mean of 32 episodes" + (f" ({len(curves)} seeds)" if len(curves) > 1 else "")
-        axes.plot(at[31:], mean, color="#a5561a", lw=1.6, label=label if k == 0 else None)
+        first = k == 0
+        axes.plot(at, cost, ".", ms=3, color="#d08b3c", alpha=0.5, mew=0)
+        ends = np.unique(at)[1:]  # episodes end together: one mean for each time that they do
+        mean = [cost[at <= end][-32:].mean() for end in ends]
+        label = f"PPO exploring, mean of 32 episodes{seeds}"
+        axes.plot(ends, mean, color="#a5561a", lw=1.8, label=label if first else None)
+        label = f"PPO, the layout that it chooses{seeds}"
+        axes.plot(
+            len(guesses), final, "D", ms=6, color="#a5561a", clip_on=False, zorder=5,
+            label=label if first else None,
+        )  # fmt: skip
     at = np.arange(1, len(guesses) + 1)
-    axes.plot(
-        at, np.minimum.accumulate(guesses), color="#2f4858", label="random agent, best so far"
-    )
+    best = np.minimum.accumulate(guesses)
+    axes.step(at, best, where="post", color="#2f4858", label="random agent, best so far")
     axes.axhline(np.mean(guesses), color="#2f4858", lw=1, ls=":", label="random agent, mean")
     axes.axhline(staggered, color="#6d675d", lw=1.2, ls="--", label="the paper's staggered layout")
     axes.set(xlabel="rollouts of the training solver", ylabel="cost (no baffles: 1.5)")
-    axes.set_xlim(0, len(guesses))
+    axes.set(xlim=(0, len(guesses)), ylim=(None, 1.52))
     axes.grid(color="#e6e0d5", lw=0.6)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=8.5, loc="upper right", bbox_to_anchor=(1, 0.98))
+    figure.legend(frameon=False, fontsize=8.5, loc="outside upper center", ncols=2)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
     print(f"learning curve: {path}")
@@ -245,7 +256,9 @@ def main() -> None:
         min(costs),
     )
     if args.figure:
-        learning_curve(args.figure, curves, costs, cost_of["the paper's staggered layout"])
+        finals = [cost for name, cost in cost_of.items() if name.startswith("PPO")]
+        staggered = cost_of["the paper's staggered layout"]
+        learning_curve(args.figure, curves, finals, costs, staggered)
     print(f"{args.rollouts} rollouts each; cost where it was trained (no baffles: 1.5):")
     for name, cost in cost_of.items():
         print(f"  {cost:.3f}  {name}")
