@@ -6,15 +6,21 @@ Heavy imports wait until a command needs them, so that --help answers at once.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import Annotated, Any, Optional
 
 import typer
 
+from design.evaluate import evaluate
+from design.options import (
+    Device,
+    SceneFile,
+    Simulator,
+    Spacing,
+    Weight,
+    objective_of,
+    simulator_spec,
+)
 from gns_model import console
-
-if TYPE_CHECKING:
-    from design.evaluators import SimulatorSpec
-    from gns_env.objective import Objective
 
 app = typer.Typer(
     help="Find where baffles stop a granular flow, checked by the reference solver.",
@@ -23,23 +29,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-SceneFile = Annotated[Path, typer.Argument(help="Scene file (TOML).", show_default=False)]
-Simulator = Annotated[
-    str, typer.Option(help="mpm, a shipped model such as baffle-lite, or a checkpoint folder.")
-]
-Spacing = Annotated[
-    Optional[float],  # noqa: UP045  (typer reads it at run time, also on Python 3.11)
-    typer.Option(help="Spacing of points for mpm [m]; default: the solver's fine one."),
-]
-Weight = Annotated[
-    Optional[float],  # noqa: UP045
-    typer.Option(
-        help="Weight of this measure, relative to no baffles; default: the objective's.",
-        show_default=False,
-    ),
-]
-Device = Annotated[str, typer.Option(help="torch device of a learned simulator: cpu or cuda.")]
-
 
 @app.command()
 def optimize(
@@ -47,7 +36,8 @@ def optimize(
     method: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option(
-            help="bayes, gradient or hybrid; default: hybrid where the simulator has a gradient."
+            help="random, rows, tpe, gp, nsga2, bayes (gp or tpe by budget), gradient or hybrid; "
+            "default: hybrid where the simulator has a gradient."
         ),
     ] = None,
     baffles: Annotated[
@@ -105,9 +95,9 @@ def optimize(
             budget=budget,
             verify=verify,
             seed=seed,
-            simulator=_spec(simulator, spacing, device),
-            verifier=_spec(verify_with, verify_spacing, device),
-            objective=_objective(
+            simulator=simulator_spec(simulator, spacing, device),
+            verifier=simulator_spec(verify_with, verify_spacing, device),
+            objective=objective_of(
                 runout_weight=runout_weight, depth_weight=depth_weight, mass_weight=mass_weight
             ),
             storage=storage,
@@ -121,55 +111,7 @@ def optimize(
             _show(summary, folder)
 
 
-@app.command()
-def evaluate(
-    layout: SceneFile,
-    simulator: Simulator = "mpm",
-    spacing: Spacing = None,
-    device: Device = "cpu",
-    json_output: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress.")] = False,
-) -> None:
-    """Measure a scene file with its baffles, beside the same scene without any."""
-    with console.clean_errors():
-        from gns_model.scene import Scene
-
-        given = Scene.from_toml(layout)
-        from design.measure import measure
-
-        result = measure(given, _spec(simulator, spacing, device), quiet=quiet)
-        if json_output:
-            import json
-
-            print(json.dumps(result, indent=2, allow_nan=False))
-        else:
-            _show_measures(result)
-
-
-def _spec(name: str, spacing: float | None, device: str) -> SimulatorSpec:
-    from design.evaluators import SimulatorSpec
-    from gns_model.errors import SimulatorError
-
-    if name == "mpm":
-        return SimulatorSpec(name, options=() if spacing is None else (("spacing", spacing),))
-    if spacing is not None:
-        raise SimulatorError(f"a spacing can be chosen for mpm only; {name} has its own")
-    import torch
-
-    try:
-        kind = torch.device(device).type
-    except RuntimeError:
-        raise SimulatorError(f"no device {device!r}: give cpu or cuda") from None
-    if kind not in ("cpu", "cuda") or (kind == "cuda" and not torch.cuda.is_available()):
-        raise SimulatorError(f"device {device!r} is not there: give cpu, or cuda on a GPU machine")
-    return SimulatorSpec(name, device=device)
-
-
-def _objective(**weights: float | None) -> Objective:
-    from gns_env.objective import Objective
-
-    given: dict[str, Any] = {name: value for name, value in weights.items() if value is not None}
-    return Objective(**given)
+app.command()(evaluate)
 
 
 def _show(summary: dict[str, Any], folder: Path) -> None:
@@ -202,33 +144,12 @@ def _show(summary: dict[str, Any], folder: Path) -> None:
     for note in summary["notes"]:
         out.print(f"Note: {note}", markup=False, highlight=False)
     out.print(
-        f"{summary['rollouts']} rollouts, {summary['backwards']} gradients, "
+        f"{summary['rollouts']} rollouts, {summary['backwards']} backward passes, "
         f"{summary['reference_rollouts']} reference rollouts, "
         f"{summary['seconds']['total']:.0f} s. Open {folder / 'report.html'}",
         markup=False,
         highlight=False,
     )
-
-
-def _show_measures(result: dict[str, Any]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    from gns_model.measures import UNITS
-
-    table = Table(title=f"{result['scene']}, {result['baffles']} baffles, by {result['simulator']}")
-    for column in ("", "with baffles", "no baffles", "change"):
-        table.add_column(column, justify="left" if not column else "right")
-    for name, unit in UNITS.items():
-        change = result["relative"].get(name)
-        table.add_row(
-            rf"{name} \[{unit}]",
-            f"{result['measures'][name]:.4g}",
-            f"{result['no_baffles'][name]:.4g}",
-            "-" if change is None else f"{100 * (change - 1):+.1f}%",
-        )
-    table.add_row("cost", f"{result['cost']:.4f}", f"{result['cost_no_baffles']:.4f}", "")
-    Console().print(table)
 
 
 def main() -> None:

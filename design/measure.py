@@ -67,5 +67,6 @@ def measure(
         "relative": {k: own[k] / none[k] for k in own if abs(none[k]) > 1e-12},
         "cost": objective.cost(own, none),
         "cost_no_baffles": objective.baseline,
+        "objective": str(objective),
         "seconds": round(sum(r.seconds for r in rolled), 2),
     }

@@ -1,0 +1,63 @@
+"""What the commands of gns-design share: how a simulator and an objective are named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Optional
+
+import typer
+
+if TYPE_CHECKING:
+    from design.evaluators import SimulatorSpec
+    from gns_env.objective import Objective
+
+SceneFile = Annotated[Path, typer.Argument(help="Scene file (TOML).", show_default=False)]
+Simulator = Annotated[
+    str, typer.Option(help="mpm, a shipped model such as baffle-lite, or a checkpoint folder.")
+]
+Spacing = Annotated[
+    Optional[float],  # noqa: UP045  (typer reads it at run time, also on Python 3.11)
+    typer.Option(help="Spacing of points for mpm [m]; default: the solver's fine one."),
+]
+Weight = Annotated[
+    Optional[float],  # noqa: UP045
+    typer.Option(
+        help="Weight of this measure, relative to no baffles; default: the objective's.",
+        show_default=False,
+    ),
+]
+Device = Annotated[str, typer.Option(help="torch device of a learned simulator: cpu or cuda.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="No progress.")]
+
+
+def simulator_spec(name: str, spacing: float | None, device: str) -> SimulatorSpec:
+    """The simulator that the options name.
+
+    Raises:
+        SimulatorError: if the options do not go together, or there is no such device.
+    """
+    from design.evaluators import SimulatorSpec
+    from gns_model.errors import SimulatorError
+
+    if name == "mpm":
+        return SimulatorSpec(name, options=() if spacing is None else (("spacing", spacing),))
+    if spacing is not None:
+        raise SimulatorError(f"a spacing can be chosen for mpm only; {name} has its own")
+    import torch
+
+    try:
+        kind = torch.device(device).type
+    except RuntimeError:
+        raise SimulatorError(f"no device {device!r}: give cpu or cuda") from None
+    if kind not in ("cpu", "cuda") or (kind == "cuda" and not torch.cuda.is_available()):
+        raise SimulatorError(f"device {device!r} is not there: give cpu, or cuda on a GPU machine")
+    return SimulatorSpec(name, device=device)
+
+
+def objective_of(**weights: float | None) -> Objective:
+    """The objective with the weights that were given and the defaults of the others."""
+    from gns_env.objective import Objective
+
+    given: dict[str, Any] = {name: value for name, value in weights.items() if value is not None}
+    return Objective(**given)
