@@ -246,6 +246,7 @@ def _forward_and_backward(
             backprop=recipe.backprop_through_unroll,
             linear_beyond=recipe.linear_beyond,
             momentum_weight=recipe.momentum_weight,
+            return_steps=recipe.return_steps,
         )
     run.optimiser.zero_grad(set_to_none=True)
     loss.backward()

@@ -39,25 +39,37 @@ def step_error(
             large: a thousandth of the points holds a quarter of the squares.
         batch: scene of every point, shape (N,); default: all in one.
         moving: mask of the points that count, shape (N,); default: all.
-        momentum_weight: of the mean over scenes of the square of a scene's mean error. An error
-            that all points share moves the centroid and hardly shows in the mean of squares.
+        momentum_weight: of the mean over scenes of the square (or pseudo-Huber) of a scene's mean
+            error. An error that all points share moves the centroid, or lets a heap sink into
+            itself, and hardly shows in the mean of squares.
     """
     error = (after - history[:, -1]) - move
     if moving is not None:
         error = error[moving]
         batch = None if batch is None else batch[moving]
     error = error / (model.config.dt**2 * model.acceleration_std)
-    square = error.square()
-    if linear_beyond is not None:
-        d = linear_beyond**2
-        square = 2 * d * ((1 + square / d).sqrt() - 1)
+    loss = _penalty(error, linear_beyond).mean()
     if momentum_weight == 0:
-        return square.mean()
+        return loss
     if batch is None:
         batch = torch.zeros(len(error), dtype=torch.long, device=error.device)
-    counts = torch.bincount(batch).to(error.dtype)[:, None]
-    mean = error.new_zeros((len(counts), error.shape[1])).index_add(0, batch, error) / counts
-    return square.mean() + momentum_weight * mean.square().mean()
+    mean = _scene_mean(error, batch)
+    return loss + momentum_weight * _penalty(mean, linear_beyond).mean()
+
+
+def _penalty(error: Tensor, linear_beyond: float | None) -> Tensor:
+    """The square of `error`, or its pseudo-Huber."""
+    square = error.square()
+    if linear_beyond is None:
+        return square
+    d = linear_beyond**2
+    return 2 * d * ((1 + square / d).sqrt() - 1)
+
+
+def _scene_mean(values: Tensor, batch: Tensor) -> Tensor:
+    """Mean of `values` (N, D) over the points of every scene, shape (S, D)."""
+    counts = torch.bincount(batch).to(values.dtype)[:, None]
+    return values.new_zeros((len(counts), values.shape[1])).index_add(0, batch, values) / counts
 
 
 def unrolled_loss(
@@ -68,6 +80,7 @@ def unrolled_loss(
     backprop: bool = False,
     linear_beyond: float | None = None,
     momentum_weight: float = 0.0,
+    return_steps: float | None = None,
 ) -> Tensor:
     """Loss after the model has taken `steps` steps on its own, a scalar.
 
@@ -77,14 +90,18 @@ def unrolled_loss(
             push-forward (Brandstetter et al. 2022): the first steps only prepare an input with
             the model's own error, and the last one is the loss.
         linear_beyond, momentum_weight: see `step_error`.
+        return_steps: with push-forward, also ask for 1/return_steps of the way back: the true
+            displacement less that part of how far the whole scene has drifted from the truth. A
+            heap that sinks into itself by a hair each step is one-step perfect and a puddle after
+            fifty; so the model learns to push back.
     """
 
-    def error(after: Tensor, k: int) -> Tensor:
+    def error(after: Tensor, move: Tensor) -> Tensor:
         return step_error(
             model,
             history,
             after,
-            batch.moves[:, k],
+            move,
             batch=batch.world.batch,
             moving=batch.moving,
             linear_beyond=linear_beyond,
@@ -97,11 +114,15 @@ def unrolled_loss(
             for _ in range(steps - 1):
                 after = model.step(history, batch.world)
                 history = torch.cat([history[:, 1:], after[:, None]], dim=1)
-        after = model.step(history, batch.world)
-        return error(after, steps - 1)
+        move = batch.moves[:, steps - 1]
+        if return_steps is not None and steps > 1:
+            scene = batch.world.batch
+            truth = batch.history[:, -1] + batch.moves[:, : steps - 1].sum(1)
+            move = move - _scene_mean(history[:, -1] - truth, scene)[scene] / return_steps
+        return error(model.step(history, batch.world), move)
     total = batch.moves.new_zeros(())
     for k in range(steps):
         after = model.step(history, batch.world)
-        total = total + error(after, k)
+        total = total + error(after, batch.moves[:, k])
         history = torch.cat([history[:, 1:], after[:, None]], dim=1)
     return total / steps

@@ -292,6 +292,23 @@ def test_an_error_that_a_scene_shares_weighs_more(free_flight):
     assert cost(even, 1000.0) < 1.2
 
 
+def test_a_drift_of_the_scene_is_asked_back(free_flight):
+    """Falling too fast by c: the displacement of the third step is off by 3 c dt², after a drift of
+    (1 + 2) c dt². To lose 1/R of that drift, the error to mend is 3 c dt² (1 + 1/R)."""
+    net, batch = ballistic(free_flight)
+    with torch.no_grad():
+        net.acceleration_mean[1] = -1.0
+        plain = float(unrolled_loss(net, batch, steps=3))
+        assert plain == pytest.approx(3.0**2 / 3, rel=0.02)  # one axis of three
+        for steps_back in (1.0, 5.0):
+            found = float(unrolled_loss(net, batch, steps=3, return_steps=steps_back))
+            assert found == pytest.approx(plain * (1 + 1 / steps_back) ** 2, rel=0.02)
+        # A first step has drifted nowhere.
+        assert float(unrolled_loss(net, batch, steps=1, return_steps=2.0)) == pytest.approx(
+            float(unrolled_loss(net, batch, steps=1))
+        )
+
+
 def test_early_windows_are_drawn_as_often_as_asked(slides):
     windows = index(slides)
     measured = statistics(windows)
