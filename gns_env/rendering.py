@@ -189,13 +189,13 @@ class SideView:
                 labelled.append(face)
                 axes.annotate(
                     f"{depths[k]:.2f} m",
-                    (face - WINDOW_LENGTH / 2, height),
-                    (0, 2.5),
+                    (face, height),
+                    (-1, 2.5),
                     textcoords="offset points",
                     color=WATERMARK,
                     fontsize=7.5,
                     weight="bold",
-                    ha="center",
+                    ha="right",
                     zorder=5,
                 )
 
