@@ -20,6 +20,7 @@ from design.options import (
     objective_of,
     simulator_spec,
 )
+from design.rebuild import report
 from gns_model import console
 
 app = typer.Typer(
@@ -112,6 +113,7 @@ def optimize(
 
 
 app.command()(evaluate)
+app.command()(report)
 
 
 def _show(summary: dict[str, Any], folder: Path) -> None:
