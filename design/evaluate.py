@@ -41,6 +41,13 @@ def evaluate(
             show_default=False,
         ),
     ] = None,
+    vtk: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(
+            help="Also write the flow with these baffles for ParaView (VTKHDF, *.vtkhdf).",
+            show_default=False,
+        ),
+    ] = None,
     simulator: options.Simulator = "mpm",
     spacing: options.Spacing = None,
     device: options.Device = "cpu",
@@ -64,13 +71,17 @@ def evaluate(
             placed = with_layout(placed, layout)
         if baffles is not None:
             placed = with_walls(placed, baffles, up)
+        if vtk is not None:
+            from gns_model.vtkhdf import check_name
+
+            check_name(vtk)
         objective = options.objective_of(
             runout_weight=runout_weight, depth_weight=depth_weight, mass_weight=mass_weight
         )
         from design.measure import measure
 
         spec = options.simulator_spec(simulator, spacing, device)
-        result = measure(placed, spec, objective=objective, quiet=quiet)
+        result = measure(placed, spec, objective=objective, vtk=vtk, quiet=quiet)
         if json_output:
             import json
 

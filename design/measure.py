@@ -14,6 +14,8 @@ from gns_env.objective import Objective
 from gns_model.console import progress_bar
 from gns_model.errors import SimulatorError
 from gns_model.scene import Scene
+from gns_model.trajectory import OK, Trajectory
+from gns_model.vtkhdf import save_vtkhdf
 
 
 def measure(
@@ -22,9 +24,16 @@ def measure(
     *,
     objective: Objective | None = None,
     workers: int | None = None,
+    vtk: Path | None = None,
     quiet: bool = True,
 ) -> dict[str, Any]:
     """Simulate `scene` with and without its baffles, side by side.
+
+    Args:
+        scene: what to measure; `spec` and `objective`: by whom and how it is weighed.
+        workers: processes; default: one for each of the two flows.
+        vtk: where to write the flow with baffles for ParaView, if anywhere.
+        quiet: no progress.
 
     Returns:
         `measures` and `no_baffles` (each as `gns_model.measures.summary`), `relative` (their ratio,
@@ -51,8 +60,10 @@ def measure(
         ):
             pass
         rolled = [p.result() for p in pending]
+        if vtk is not None and rolled[0].status == OK:
+            save_vtkhdf(Trajectory.load(rolled[0].path), vtk)
     for s, r in zip(scenes, rolled, strict=True):
-        if r.status != "ok":
+        if r.status != OK:
             raise SimulatorError(
                 f"the rollout of {spec.name} with {len(s.baffles)} baffles ended as {r.status!r}"
             )

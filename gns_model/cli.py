@@ -56,6 +56,9 @@ def simulate(
     simulator: Annotated[
         str, typer.Option(help="mpm, a shipped model, or a checkpoint folder.")
     ] = "mpm",
+    vtk: Annotated[
+        Path | None, typer.Option(help="Also write it for ParaView (VTKHDF, *.vtkhdf).")
+    ] = None,
     threads: Annotated[int, typer.Option(min=1, help="Threads of the solver.")] = CORES,
     spacing: Annotated[
         float | None, typer.Option(help="Of the solver's points [m]; default: the paper's.")
@@ -65,7 +68,10 @@ def simulate(
     """Run one scene and write its trajectory."""
     from gns_model import measures
     from gns_model.simulator import load_simulator
+    from gns_model.vtkhdf import check_name, save_vtkhdf
 
+    if vtk is not None:
+        check_name(vtk)
     options: dict[str, Any] = {}
     if simulator == "mpm":
         options = {"threads": threads, "spacing": spacing}
@@ -79,6 +85,9 @@ def simulate(
         trajectory = runner.rollout([loaded], progress=lambda f: bar.update(task, completed=f))[0]
     trajectory.save(out)
     print(f"{out}: {trajectory.status}, {trajectory.positions.shape[1]} points")
+    if vtk is not None:
+        save_vtkhdf(trajectory, vtk)
+        print(f"{vtk}: for ParaView")
     for key, value in measures.summary(trajectory).items():
         print(f"  {key:20s} {value:10.4f} {measures.UNITS[key]}")
 

@@ -2,6 +2,7 @@
 
 import json
 
+import h5py
 import numpy as np
 import pytest
 import trimesh
@@ -183,6 +184,7 @@ def test_evaluate_walls_as_json(scene_file, tmp_path, capsys):
     placed = Scene.from_toml(scene_file).with_baffles([[0.5, 0.2], [0.5, 0.42]])
     mesh = write_geometry(placed, tmp_path, "walls")["stl"]
     options = ["--spacing", "0.0625", "--json", "--quiet", "--depth-weight", "1"]
+    options += ["--vtk", str(tmp_path / "flow.vtkhdf")]
     with pytest.raises(SystemExit) as left:
         console.main(
             app, "gns-design", ["evaluate", str(scene_file), "--baffles", str(mesh), *options]
@@ -192,6 +194,8 @@ def test_evaluate_walls_as_json(scene_file, tmp_path, capsys):
     solver = MpmSimulator(spacing=0.0625, threads=1)
     scenes = [placed, placed.with_baffles([])]
     own, none = (summary(t) for t in solver.rollout(scenes))
+    with h5py.File(tmp_path / "flow.vtkhdf") as file:
+        assert file["VTKHDF/Polygons/NumberOfCells"][0] == 12
     assert result["baffles"] == 2
     assert result["measures"] == pytest.approx(own)
     assert result["no_baffles"] == pytest.approx(none)
@@ -208,6 +212,7 @@ def test_evaluate_refuses_in_one_line(scene_file, tmp_path, capsys):
         (["--layout", tmp_path / "none.toml"], "none.toml"),
         (["--layout", scene_file, "--baffles", walls], "not both"),
         (["--up", "y"], "--up"),
+        (["--vtk", "flow.vtu"], "flow.vtu"),
         (["--baffles", walls, "--up", "x"], "--up"),
         (["--depth-weight", "-1", "--layout", scene_file], "depth_weight"),
     ):
