@@ -1,4 +1,4 @@
-"""What a search has to beat: engineering rows, and layouts by chance.
+"""What a search has to beat: layouts by chance, and rows as an engineer draws them.
 
 Practice puts baffles in one row across the flow or in two staggered rows (findings/FIELD.md). These
 are enqueued before anything is sampled, so that a search starts from what an engineer would try and
@@ -8,15 +8,123 @@ never returns less.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import product
 
 import numpy as np
 
+from design.campaign import Campaign
 from gns_env.layout import LayoutSpace
 
 #: Where along the placement area a single row is tried: 0 upstream, 1 downstream.
 ROW_PLACES = (0.0, 0.33, 0.67)
 #: Upstream and downstream row of a staggered pair.
 STAGGERED_PLACES = ((0.0, 0.4), (0.2, 0.8))
+#: Most rows one behind the other: practice builds two or three (findings/FIELD.md).
+MOST_ROWS = 3
+#: Finest grid of rows: places and spacings are divided into 2 times 2^level parts at most.
+LAST_LEVEL = 3
+
+
+def random_search(campaign: Campaign) -> None:
+    """Random buildable layouts until the budget is spent."""
+    while (left := campaign.left()) > 0:
+        count = min(campaign.batch, left)
+        campaign.run(list(random_layouts(campaign.space, count, campaign.rng(3))))
+
+
+def rows_search(campaign: Campaign) -> None:
+    """Rows: the usual ones, then every number of rows, stagger and spacing, ever finer.
+
+    Ends when the budget is spent or the finest grid has been tried.
+    """
+    campaign.run(
+        [layout for layout in engineering_layouts(campaign.space) if new(campaign, layout)]
+    )
+    for level in range(LAST_LEVEL + 1):
+        if not campaign.left():
+            return
+        grid = [("rows", centres) for centres in rows(campaign.space, level)]
+        # What a budget cuts off a grid should not be one side of it.
+        order = np.random.default_rng([campaign.seed, level]).permutation(len(grid))
+        campaign.run([grid[k] for k in order if new(campaign, grid[k])])
+
+
+def new(campaign: Campaign, layout: tuple[str, np.ndarray]) -> bool:
+    """Whether no trial is of this layout yet."""
+    centres = campaign.log.buildable(layout[1])
+    return not any(np.allclose(t.centres, centres, atol=1e-4) for t in campaign.log.trials())
+
+
+def rows(space: LayoutSpace, level: int) -> list[np.ndarray]:
+    """Buildable layouts [m], shape (n, D-1), in straight rows on a grid; twice as fine a level.
+
+    In 3D one to three rows across the flow, centred, of equal numbers of baffles up to one; each
+    second row shifted by half the spacing across or not; the spacing across from the closest that
+    the gap allows to the widest that fits, the spacing along likewise. In 2D a row is one baffle,
+    and what varies is where the series starts and its spacing. What stands in a keep-out is left
+    out.
+    """
+    found: dict[tuple[float, ...], np.ndarray] = {}
+    steps = np.linspace(0.0, 1.0, 2 * 2**level + 1)
+    length = float(space.upper[0] - space.lower[0])
+    plane = len(space.lower) == 1
+    counts = [(1,) * space.n_baffles] if plane else _row_counts(space.n_baffles)
+    for columns in counts:
+        more = len(columns) - 1
+        room = length - more * float(space.separation[0])
+        if room < -1e-9:
+            continue
+        for start, wider in product(steps, steps if more else steps[:1]):
+            # Start and spacing share the room that the closest rows leave.
+            first = float(space.lower[0]) + start * room
+            along = float(space.separation[0])
+            along += wider * (1 - start) * room / max(more, 1)
+            x = first + along * np.repeat(np.arange(len(columns)), columns)
+            for across in (
+                [np.zeros((space.n_baffles, 0))] if plane else _rows_across(space, columns, steps)
+            ):
+                centres = np.column_stack([x, across])
+                if not space.check(centres):
+                    key = tuple(centres[np.lexsort(centres.T)].ravel().round(4))
+                    found.setdefault(key, centres)
+    return list(found.values())
+
+
+def _row_counts(n: int) -> list[tuple[int, ...]]:
+    """How n baffles divide into one to three rows whose numbers differ by one at most."""
+    divided: list[tuple[int, ...]] = []
+    for count in range(1, min(n, MOST_ROWS) + 1):
+        few, longer = divmod(n, count)
+        fronts = [(few + 1,) * longer + (few,) * (count - longer)]
+        if longer:
+            fronts.append(fronts[0][::-1])
+            if count == 3:  # the odd row in the middle
+                fronts.append((few, few + 1, few) if longer == 1 else (few + 1, few, few + 1))
+        divided += dict.fromkeys(fronts)
+    return divided
+
+
+def _rows_across(
+    space: LayoutSpace, columns: tuple[int, ...], steps: np.ndarray
+) -> Iterator[np.ndarray]:
+    """Places across of all baffles [m], shape (n, 1), row after row."""
+    width = float(space.upper[1] - space.lower[1])
+    middle = float(space.lower[1] + space.upper[1]) / 2
+    closest = float(space.separation[1])
+    for stagger in (0.0, 0.5) if len(columns) > 1 else (0.0,):
+        offsets = [
+            np.arange(n) - (n - 1) / 2 + (stagger if k % 2 else 0.0) for k, n in enumerate(columns)
+        ]
+        # Rows of unequal numbers stand behind the gaps by themselves, and behind each other if
+        # shifted; the whole pattern is centred.
+        flat = np.concatenate(offsets)
+        flat = flat - (flat.max() + flat.min()) / 2
+        reach = float(np.ptp(flat))
+        widest = width / reach if reach else closest
+        if widest < closest - 1e-9:
+            continue
+        for share in steps if reach else steps[:1]:
+            yield middle + (flat * (closest + share * (widest - closest)))[:, None]
 
 
 def engineering_layouts(space: LayoutSpace) -> Iterator[tuple[str, np.ndarray]]:

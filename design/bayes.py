@@ -28,14 +28,38 @@ LEAST_STARTUP = 10
 #: and 1.314 and 1.303 with TPE (two seeds); the best baseline has 1.331. A proposal takes 0.1 to
 #: 0.25 s of CPU, against 0.03 s with TPE.
 MOST_PROCESS_TRIALS = 150
+#: Generations that the budget of NSGA-II is divided into, and its largest population.
+GENERATIONS, MOST_POPULATION = 5, 50
 
 
 def search(campaign: Campaign, until: int | None = None) -> None:
-    """Baselines first, then batches from the sampler, until the budget (or `until`) is spent."""
+    """Baselines first, then batches of the sampler that suits the budget, to its end or `until`."""
+    few = campaign.passes <= MOST_PROCESS_TRIALS
+    _search(campaign, "gp" if few else "tpe", "bayes", until)
+
+
+def tpe(campaign: Campaign) -> None:
+    """Baselines, then a multivariate tree-structured Parzen estimator."""
+    _search(campaign, "tpe")
+
+
+def gp(campaign: Campaign) -> None:
+    """Baselines, then a Gaussian process."""
+    _search(campaign, "gp")
+
+
+def nsga2(campaign: Campaign) -> None:
+    """Baselines, then generations of NSGA-II."""
+    _search(campaign, "nsga2")
+
+
+def _search(campaign: Campaign, kind: str, origin: str = "", until: int | None = None) -> None:
+    """`origin`: what its trials are called; default: the kind of sampler."""
     enqueue_baselines(campaign)
-    goal = campaign.budget if until is None else min(until, campaign.budget)
-    while (left := goal - campaign.log.spent()) > 0:
-        campaign.try_proposals(min(campaign.batch, left), sampler(campaign))
+    goal = campaign.passes if until is None else min(until, campaign.passes)
+    while (left := goal - campaign.spent()) > 0:
+        count = min(campaign.batch, left)
+        campaign.try_proposals(count, sampler(campaign, kind), origin or kind)
 
 
 def enqueue_baselines(campaign: Campaign) -> None:
@@ -44,20 +68,26 @@ def enqueue_baselines(campaign: Campaign) -> None:
         campaign.log.enqueue(origin, centres)
 
 
-def sampler(campaign: Campaign) -> optuna.samplers.BaseSampler:
-    """The sampler of the next batch. Made anew for each, so that resuming changes nothing."""
+def sampler(campaign: Campaign, kind: str) -> optuna.samplers.BaseSampler:
+    """The sampler "tpe", "gp" or "nsga2" of the next batch.
+
+    Made anew for each batch, so that resuming changes nothing.
+    """
     rng = campaign.rng()
     seed = int(rng.integers(2**31))
     startup = max(LEAST_STARTUP, 2 * campaign.space.dim)
     model: optuna.samplers.BaseSampler
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-        if len(campaign.log.trials()) <= MOST_PROCESS_TRIALS:
+        if kind == "gp":
             model = optuna.samplers.GPSampler(n_startup_trials=startup, seed=seed)
-        else:
+        elif kind == "tpe":
             model = optuna.samplers.TPESampler(
                 multivariate=True, constant_liar=True, n_startup_trials=startup, seed=seed
             )
+        else:
+            size = min(max(campaign.passes // GENERATIONS, LEAST_STARTUP), MOST_POPULATION)
+            model = optuna.samplers.NSGAIISampler(population_size=size, seed=seed)
     return BuildableSampler(model, campaign.log, rng)
 
 
@@ -83,8 +113,11 @@ class BuildableSampler(optuna.samplers.BaseSampler):
     ) -> dict[str, Any]:
         """Parameters of the next proposal."""
         wish = self._model.sample_relative(study, trial, search_space)
-        space = self._log.space
-        return wish or dict(to_parameters(space, space.random(self._rng)))
+        if not wish:
+            space = self._log.space
+            return dict(to_parameters(space, space.random(self._rng)))
+        # NSGA-II leaves out what it mutates: that is uniform.
+        return {n: wish[n] if n in wish else self._rng.uniform() for n in self._log.distributions}
 
     def sample_independent(
         self,

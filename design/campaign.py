@@ -41,6 +41,7 @@ class Campaign:
         log: every trial so far, also those of an earlier run that is resumed.
         evaluator: runs layouts.
         budget: passes through a rollout to spend in all; a backward pass counts like a forward one.
+        price: rollouts that one layout takes: one in each scenario.
         seed: of everything random.
         batch: layouts proposed before their results are looked at. Fixed, and not the number of
             workers, so that a seed gives the same search on every machine.
@@ -55,33 +56,53 @@ class Campaign:
     batch: int = 8
     on_trial: Callable[[Trial], None] = lambda trial: None
     salt: int = 0
+    price: int = 1
 
     @property
     def space(self) -> LayoutSpace:
         """The buildable layouts."""
         return self.log.space
 
+    @property
+    def passes(self) -> int:
+        """The budget in passes through a layout, all its scenarios together."""
+        return self.budget // self.price
+
+    def spent(self) -> int:
+        """Passes through a layout so far, also those of an earlier run that is resumed."""
+        return self.log.spent() // self.price
+
     def left(self) -> int:
-        """Passes through a rollout still to spend."""
-        return max(self.budget - self.log.spent(), 0)
+        """Passes through a layout still to spend."""
+        return max(self.passes - self.spent(), 0)
 
     def rng(self, *salt: int) -> np.random.Generator:
         """Randomness that depends on the seed and on how far the search is, so that a resumed
         search goes on as it would have."""
         return np.random.default_rng([self.seed, self.salt, len(self.log.trials()), *salt])
 
-    def try_proposals(self, count: int, sampler: optuna.samplers.BaseSampler) -> list[Trial]:
+    def try_proposals(
+        self, count: int, sampler: optuna.samplers.BaseSampler, origin: str
+    ) -> list[Trial]:
         """Ask for `count` layouts, run them, tell their outcomes as they come."""
         proposals: list[Proposal] = []
         trials = []
         try:
-            proposals = self.log.ask(count, sampler)
+            proposals = self.log.ask(count, sampler, origin)
             for k, outcome in self.evaluator.evaluate([p.centres for p in proposals]):
                 trials.append(self.log.tell(proposals[k], outcome))
                 self.on_trial(trials[-1])
         finally:
             self.log.abandon()
         return trials
+
+    def run(self, layouts: Sequence[tuple[str, np.ndarray]]) -> None:
+        """Run layouts (origin, centres [m]), a batch at a time, as far as the budget goes."""
+        layouts = list(layouts)
+        while layouts and (left := self.left()) > 0:
+            now, layouts = layouts[: min(self.batch, left)], layouts[min(self.batch, left) :]
+            for k, outcome in self.evaluator.evaluate([centres for _, centres in now]):
+                self.record(*now[k], outcome)
 
     def record(self, origin: str, centres: np.ndarray, outcome: Outcome) -> Trial:
         """Put a layout that the log did not ask for on record."""

@@ -190,6 +190,7 @@ def run(task: BaffleTask, layouts: Sequence[np.ndarray]) -> list[Outcome]:
             measures={} if e.failed else dict(e.measures),
             status=e.status,
             seconds=seconds,
+            costs=e.costs if len(e.costs) > 1 else (),
         )
         for e in evaluations
     ]

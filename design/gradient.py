@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from design.baselines import engineering_layouts, random_layouts
 from design.campaign import Campaign
@@ -57,8 +58,7 @@ def search(campaign: Campaign) -> None:
         starts = [*engineering_layouts(space), *random_layouts(space, STARTS, campaign.rng(1))]
         # At least half of the budget is for steps.
         starts = starts[: max(campaign.left() // 2, 1)]
-        for k, outcome in campaign.evaluator.evaluate([c for _, c in starts]):
-            campaign.record(*starts[k], outcome)
+        campaign.run(starts)
     first = True
     while campaign.left() >= 2:
         if first:
@@ -157,6 +157,58 @@ class Chain:
         self._square, self._count = 0.0, 0
 
 
+def cost_and_gradient(
+    task: BaffleTask, layout: ArrayLike, *, limit: float | None = ADJOINT_LIMIT
+) -> tuple[float, np.ndarray]:
+    """The smooth cost of a layout and its derivative, by one rollout and one backward pass.
+
+    Args:
+        task: with a simulator that has a gradient; of several objectives the sum counts.
+        layout: centres [m], shape (n, D-1), in any order.
+        limit: of a grain's adjoint, in medians (`gns_model.learned.rollout.LimitAdjoint`), which
+            keeps the gradient of a long flow useful; None: the exact derivative.
+
+    Returns:
+        the cost of the smooth measures, relative to no baffles, and d cost / d layout [1/m], shape
+        (n, D-1). The hard cost that a search reports is `task.evaluate([layout])[0].cost`.
+
+    Raises:
+        SimulatorError: if the simulator has no gradient or the rollout diverges.
+        LayoutError, SceneError: if the layout is none.
+    """
+    import torch
+
+    if not hasattr(task.simulator, "rollout_tensor"):
+        raise SimulatorError(f"the simulator {task.simulator.name!r} has no gradient")
+    centres = torch.tensor(task.space.as_centres(layout).copy(), requires_grad=True)
+    _, costs = _smooth_costs(task, [centres], limit)
+    costs.sum().backward()
+    cost = float(costs.detach().sum())
+    gradient = None if centres.grad is None else centres.grad.numpy()
+    if gradient is None or not (np.isfinite(cost) and np.isfinite(gradient).all()):
+        raise SimulatorError("the rollout of this layout diverged, so it has no gradient")
+    return cost, gradient
+
+
+def _smooth_costs(
+    task: BaffleTask, centres: Sequence[Tensor], limit: float | None
+) -> tuple[list[Tensor], Tensor]:
+    """Positions (T, N, D) and the smooth cost of each layout (n, D-1), shape (layouts,)."""
+    import torch
+
+    from gns_model.smooth_measures import smooth_measures
+
+    scenes = [task.scene_with(c.detach().numpy()) for c in centres]
+    rollouts = task.simulator.rollout_tensor(scenes, centres, limit=limit)  # type: ignore[attr-defined]
+    reference, size = task.reference, tuple(task.space.size)
+    costs = []
+    for positions, scene, c in zip(rollouts, scenes, centres, strict=True):
+        measures = smooth_measures(positions, scene, c.to(positions), size)
+        terms = [objective.smooth(measures, reference) for objective in task.objectives]
+        costs.append(torch.stack([term.to(torch.float64).cpu() for term in terms]).sum())
+    return rollouts, torch.stack(costs)
+
+
 def differentiate(task: BaffleTask, layouts: Sequence[np.ndarray]) -> list[Outcome]:
     """One rollout and one backward pass of each layout [m], shape (n, D-1), as one batch.
 
@@ -164,25 +216,15 @@ def differentiate(task: BaffleTask, layouts: Sequence[np.ndarray]) -> list[Outco
     """
     import torch
 
-    from gns_model.smooth_measures import smooth_measures
-
     started = time.perf_counter()
-    simulator = task.simulator
-    scenes = [task.scene_with(layout) for layout in layouts]
     centres = [torch.tensor(np.asarray(c, dtype=np.float64), requires_grad=True) for c in layouts]
-    rollouts = simulator.rollout_tensor(scenes, centres, limit=ADJOINT_LIMIT)  # type: ignore[attr-defined]
-    reference = task.reference
-    smooth = [
-        task.objective.smooth(
-            smooth_measures(positions, scene, c, tuple(task.space.size)), reference
-        )
-        for positions, scene, c in zip(rollouts, scenes, centres, strict=True)
-    ]
-    torch.stack([s.to(torch.float64) for s in smooth]).sum().backward()
+    rollouts, costs = _smooth_costs(task, centres, ADJOINT_LIMIT)
+    costs.sum().backward()
     seconds = (time.perf_counter() - started) / len(layouts)
     outcomes = []
-    for positions, scene, c in zip(rollouts, scenes, centres, strict=True):
+    for positions, c in zip(rollouts, centres, strict=True):
         gradient = c.grad.detach().cpu().numpy() if c.grad is not None else None
+        scene = task.scene_with(c.detach().numpy())
         outcomes.append(_outcome(task, positions, scene, gradient, seconds))
     return outcomes
 

@@ -27,15 +27,15 @@ def search(campaign: Campaign) -> None:
         SimulatorError: if the simulator has no gradient.
     """
     require_gradient(campaign)
-    bayes.search(campaign, until=round(EXPLORE * campaign.budget))
+    bayes.search(campaign, until=round(EXPLORE * campaign.passes))
     while campaign.left() > 0:
         leap(campaign)
-        bayes.search(campaign, until=campaign.log.spent() + campaign.batch)
+        bayes.search(campaign, until=campaign.spent() + campaign.batch)
 
 
 def leap(campaign: Campaign) -> None:
     """Gradient steps from the best layouts that no gradient has been taken at or near."""
-    budget = min(round(LEAP * campaign.budget), campaign.left())
+    budget = min(round(LEAP * campaign.passes), campaign.left())
     count = min(CHAINS, max(budget // (2 * LEAST_GRADIENTS), 1))
     trials = sorted((t for t in campaign.log.trials() if t.ok), key=lambda t: t.cost)
     leapt = [t.centres for t in trials if t.origin == "gradient"]

@@ -32,7 +32,8 @@ import numpy as np
 from design.campaign import Campaign, Evaluator
 from design.evaluators import InProcess, InWorkers, KnownReference, SimulatorSpec, TaskSpec
 from design.evaluators import differentiable as has_gradient
-from design.settings import METHODS, Settings
+from design.methods import METHODS, choose
+from design.settings import Settings
 from design.store import Pending, Rolled, RolloutStore, Watch
 from design.summary import (
     COMPLETE,
@@ -119,15 +120,9 @@ class Run:
         self.space = LayoutSpace(scene, self.baffles)
         self.bare = scene.replace(baffles=(), placement=self.space.placement)
         self.notes = _check(scene, settings)
-        self.method = settings.method or (
-            "hybrid" if has_gradient(settings.simulator.load()) else "bayes"
+        self.method = choose(
+            settings.method, has_gradient(settings.simulator.load()), 1, settings.simulator.name
         )
-        if self.method != "bayes" and not has_gradient(settings.simulator.load()):
-            raise SimulatorError(
-                f"the simulator {settings.simulator.name!r} has no gradient, so --method "
-                f"{self.method} cannot use it: choose a learned simulator such as baffle-lite, or "
-                "--method bayes"
-            )
         of_use = max(settings.batch, settings.verify + 2)
         self.workers = settings.workers or max(1, min(default_count(), of_use))
         self.storage = settings.storage or sqlite_url(out / "study.db")

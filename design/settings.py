@@ -4,17 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from design import bayes, gradient, hybrid
-from design.campaign import Search
 from design.evaluators import SimulatorSpec
+from design.methods import METHODS
 from gns_env.objective import Objective
 from gns_model.errors import GnsError
-
-METHODS: dict[str, Search] = {
-    "bayes": bayes.search,
-    "gradient": gradient.search,
-    "hybrid": hybrid.search,
-}
 
 
 class SettingError(GnsError, ValueError):
@@ -26,7 +19,7 @@ class Settings:
     """What can be chosen about a run.
 
     Attributes:
-        method: "bayes", "gradient" or "hybrid"; None: hybrid where the simulator has a gradient.
+        method: a key of `methods.METHODS`; None: hybrid where the simulator has a gradient.
         baffles: how many; None: as many as the scene has, or 3.
         budget: passes through a rollout that the search may spend.
         verify: how many of the best layouts the reference solver judges; 0: none at all.

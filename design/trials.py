@@ -46,6 +46,8 @@ class Outcome:
         backwards: backward passes through a rollout spent.
         seconds: spent on it.
         gradient: d(smooth cost)/d(centres) [1/m], shape (n, D-1), if it was asked for.
+        costs: one cost for each objective, of a search with several; `cost` is their sum.
+        flows: the cost in each scenario, of a robust search; `cost` is their mean or CVaR then.
     """
 
     cost: float
@@ -55,6 +57,8 @@ class Outcome:
     backwards: int = 0
     seconds: float = 0.0
     gradient: np.ndarray | None = None
+    costs: tuple[float, ...] = ()
+    flows: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -107,6 +111,7 @@ class TrialLog:
         *,
         resume: bool,
         owned: bool,
+        objectives: int = 1,
     ) -> TrialLog:
         """Create or resume the study `name` in `storage`.
 
@@ -115,6 +120,7 @@ class TrialLog:
                 a study of another task is refused.
             resume: go on with a study that exists.
             owned: nobody else uses the storage, so trials left running are leftovers of a crash.
+            objectives: how many costs a trial has.
 
         Raises:
             StudyError: if the storage cannot be reached, the study exists and `resume` is not set,
@@ -124,7 +130,10 @@ class TrialLog:
             backend = _backend(storage)
             try:
                 study = optuna.create_study(
-                    storage=backend, study_name=name, direction="minimize", load_if_exists=resume
+                    storage=backend,
+                    study_name=name,
+                    directions=["minimize"] * objectives,
+                    load_if_exists=resume,
                 )
             except optuna.exceptions.DuplicatedStudyError:
                 raise StudyError(
@@ -148,9 +157,7 @@ class TrialLog:
         if self._backend is not None:
             self._backend.engine.dispose()
 
-    def ask(
-        self, count: int, sampler: optuna.samplers.BaseSampler, origin: str = "bayes"
-    ) -> list[Proposal]:
+    def ask(self, count: int, sampler: optuna.samplers.BaseSampler, origin: str) -> list[Proposal]:
         """`count` layouts to run: those enqueued first, then the sampler's, all buildable."""
         self.study.sampler = sampler
         proposals = []
@@ -175,7 +182,7 @@ class TrialLog:
         """Record what a proposal gave. A failure is told with its finite penalty."""
         trial = self._asked.pop(proposal.number)
         trial.set_user_attr("record", _record(proposal.origin, proposal.centres, outcome))
-        self.study.tell(trial, self._value(outcome))
+        self.study.tell(trial, self._values(outcome))
         return Trial(proposal.number, proposal.origin, proposal.centres, outcome)
 
     def add(self, origin: str, centres: np.ndarray, outcome: Outcome) -> Trial:
@@ -185,21 +192,26 @@ class TrialLog:
             optuna.create_trial(
                 params=to_parameters(self.space, centres),
                 distributions=self.distributions,
-                value=self._value(outcome),
+                values=self._values(outcome),
                 user_attrs={"record": _record(origin, centres, outcome)},
             )
         )
         return Trial(len(self.study.get_trials(deepcopy=False)) - 1, origin, centres, outcome)
 
-    def _value(self, outcome: Outcome) -> float:
+    def _values(self, outcome: Outcome) -> list[float]:
         """What the sampler is told: a failure is worse than all that worked by their whole spread.
 
         Its own cost lies so far off that a model of all trials would see nothing else.
         """
+        several = len(self.study.directions) > 1
+        own = list(outcome.costs) if several else [outcome.cost]
         if outcome.status == "ok":
-            return outcome.cost
-        costs = [trial.cost for trial in self.trials() if trial.ok]
-        return 2 * max(costs) - min(costs) if len(costs) > 1 else outcome.cost
+            return own
+        known = [t.outcome.costs if several else (t.cost,) for t in self.trials() if t.ok]
+        if len(known) < 2:
+            return own
+        costs = np.array(known)
+        return [float(v) for v in 2 * costs.max(axis=0) - costs.min(axis=0)]
 
     def abandon(self) -> None:
         """Mark what was asked for and will not be told, so that nobody waits for it."""
@@ -240,11 +252,16 @@ def table(trials: Sequence[Trial]) -> str:
         for j in range(trials[0].centres.shape[1])
     ]
     spent = ["rollouts", "backwards", "seconds"]
-    writer.writerow(["number", "origin", "status", "cost", *measures, *columns, *spent])
+    parts = [
+        *(f"cost_{k + 1}" for k in range(max((len(t.outcome.costs) for t in trials), default=0))),
+        *(f"flow_{k + 1}" for k in range(max((len(t.outcome.flows) for t in trials), default=0))),
+    ]
+    writer.writerow(["number", "origin", "status", "cost", *parts, *measures, *columns, *spent])
     for t in trials:
         o = t.outcome
         writer.writerow(
             [t.number, t.origin, o.status, repr(float(o.cost))]
+            + [repr(float(c)) for c in (*o.costs, *o.flows)]
             + [repr(float(o.measures[m])) if m in o.measures else "" for m in measures]
             + [f"{c:.6f}" for c in t.centres.ravel()]
             + [o.rollouts, o.backwards, f"{o.seconds:.3f}"]
@@ -302,6 +319,8 @@ def _record(origin: str, centres: np.ndarray, outcome: Outcome) -> dict[str, Any
         "rollouts": outcome.rollouts,
         "backwards": outcome.backwards,
         "seconds": outcome.seconds,
+        "costs": list(outcome.costs),
+        "flows": list(outcome.flows),
     }
 
 
@@ -316,6 +335,8 @@ def _trial(frozen: FrozenTrial) -> Trial | None:
         rollouts=int(record["rollouts"]),
         backwards=int(record["backwards"]),
         seconds=float(record["seconds"]),
+        costs=tuple(map(float, record.get("costs", ()))),
+        flows=tuple(map(float, record.get("flows", ()))),
     )
     return Trial(frozen.number, str(record["origin"]), np.array(record["centres"]), outcome)
 

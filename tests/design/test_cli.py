@@ -117,7 +117,7 @@ def test_simulators_that_are_not_there(capsys, scene_file, tmp_path):
         (["--budget", "many"], "--budget"),
         (["--verify", "-1"], "verify must be 0 or more"),
         (["--workers", "0"], "workers must be 1 or more"),
-        (["--method", "guess"], "bayes, gradient, hybrid"),
+        (["--method", "guess"], "random, rows, bayes"),
         (["--method", "gradient"], "no gradient"),
         (["--depth-weight", "-1"], "depth_weight"),
         (["--spacing", "-1"], "spacing must be positive"),
