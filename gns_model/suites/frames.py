@@ -55,7 +55,7 @@ def _side_views(rows: Sequence[tuple[str, Pair, float]], name: str, path: Path) 
     height = 1.1 * max(float(t.positions[k, :, 1].max()) for row in views for t, k in row) - base
     figure = Figure(
         figsize=(10.5, (4.9 * height / width + 0.12) * len(rows) + 1.1),
-        layout=ConstrainedLayoutEngine(h_pad=0.08),
+        layout=ConstrainedLayoutEngine(h_pad=0.08, compress=True),
     )
     grid = figure.subplots(len(rows), 2, squeeze=False, sharex=True, sharey=True)
     dots: PathCollection | None = None
@@ -94,7 +94,7 @@ def plan_views(pair: Pair, times: Sequence[float], name: str, path: Path) -> Non
     width, _, depth = scene.domain.size
     figure = Figure(
         figsize=(2.75 * len(times) + 0.5, 2.75 * 2 * depth / width + 1.5),
-        layout=ConstrainedLayoutEngine(h_pad=0.08),
+        layout=ConstrainedLayoutEngine(h_pad=0.08, compress=True),
     )
     grid = figure.subplots(2, len(times), squeeze=False, sharex=True, sharey=True)
     top = 0.0
