@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from torch.utils.checkpoint import checkpoint as rematerialise
 from gns_model.learned.config import ModelConfig
 from gns_model.learned.divergence import astray, speed_limit
 from gns_model.learned.model import LearnedModel
-from gns_model.learned.start import Start, start
+from gns_model.learned.start import Start, launched, start
 from gns_model.learned.world import World
 from gns_model.particles import Points
 from gns_model.scene import Scene
@@ -122,11 +123,22 @@ def roll_out_tensor(
     checkpoint: bool,
     noise: Sequence[Tensor] | None,
     limit: float | None,
+    velocities: Sequence[Tensor] | None = None,
+    tan_friction: Sequence[Tensor] | None = None,
 ) -> list[Tensor]:
     """As `LearnedSimulator.rollout_tensor`, which see."""
     config = model.config
     lengths = [frames or frame_count(config, scene) for scene in scenes]
     starts = start(config, scenes, points, centres, **place(model))
+    if velocities is not None:
+        starts = [
+            launched(config, s, p, v) for s, p, v in zip(starts, points, velocities, strict=True)
+        ]
+    if tan_friction is not None:
+        starts = [
+            replace(s, tan_friction=t.to(s.history).expand(len(s.history)))
+            for s, t in zip(starts, tan_friction, strict=True)
+        ]
     moving, histories = [s.rows for s in starts], [s.history for s in starts]
     if noise is not None:
         for history, shift, n in zip(histories, noise, moving, strict=True):

@@ -311,8 +311,10 @@ class LearnedSimulator:
         checkpoint: bool = True,
         noise: Sequence[Tensor] | None = None,
         limit: float | None = None,
+        velocities: Sequence[Tensor] | None = None,
+        tan_friction: Sequence[Tensor] | None = None,
     ) -> list[Tensor]:
-        """A rollout that autograd can differentiate with respect to the baffles.
+        """A rollout that autograd can differentiate: in the baffles, the release or the friction.
 
         Nothing is caught here: a rollout that diverges returns what it computed.
 
@@ -326,16 +328,22 @@ class LearnedSimulator:
             noise: displacement of the starting points [m], a tensor (N, D) for each scene.
             limit: of a grain's adjoint in every step, see `rollout.LimitAdjoint`; default: none,
                 the exact gradient, which over a whole flow says little about a finite move.
+            velocities: of the points at their release [m/s], a tensor (D,) or (N, D) for each
+                scene, in place of the scene's.
+            tan_friction: tan of the friction angle, a tensor () or (N,) for each scene, in place of
+                the scene's; the model has to see it.
 
         Returns:
             positions [m], (T, N, D) for each scene, in the dtype of the model.
 
         Raises:
-            SimulatorError, SceneError: as `check`.
+            SimulatorError, SceneError: as `check`; or for a friction that the model does not see.
         """
         scenes = list(scenes)
         for scene in scenes:
             self.check(scene)
+        if tan_friction is not None and "tan_friction_angle" not in self.config.material_features:
+            raise SimulatorError(f"{self.name} does not see the friction angle")
         points = [self._fill(scene) for scene in scenes]
         with self._settings():
             return roll_out_tensor(
@@ -347,6 +355,8 @@ class LearnedSimulator:
                 checkpoint=checkpoint,
                 noise=noise,
                 limit=limit,
+                velocities=velocities,
+                tan_friction=tan_friction,
             )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -65,3 +65,15 @@ def start(
             kind = torch.cat([kind, kind.new_full((len(fixed),), STATIONARY)])
         starts.append(Start(history, kind, len(position)))
     return starts
+
+
+def launched(config: ModelConfig, begin: Start, points: Points, velocity: Tensor) -> Start:
+    """`begin` with other velocities of the release [m/s], (D,) or (N, D), differentiable in them.
+
+    The points are where they were at t = 0, and the history before it is the new motion.
+    """
+    own = torch.tensor(points.velocities).to(begin.history)
+    change = velocity.to(begin.history) - own
+    past = torch.arange(config.history, -1, -1).to(begin.history) * config.dt
+    moved = begin.history[: begin.rows] - change[:, None] * past[:, None]
+    return replace(begin, history=torch.cat([moved, begin.history[begin.rows :]]))
