@@ -160,7 +160,10 @@ def test_human_rendering_without_pygame_is_one_clear_error(
     [
         ("random_agent.py", ["--simulator", "mpm", "--spacing", "0.0625", "--episodes", "3"]),
         ("optuna_env.py", ["--simulator", "mpm", "--spacing", "0.0625", "--rollouts", "24"]),
-        ("ppo_vector.py", ["--rollouts", "100", "--no-verify", "--figure", "{folder}/curve.png"]),
+        (
+            "ppo_vector.py",
+            ["--rollouts=60", "--spacing=0.08", "--no-verify", "--figure={folder}/curve.png"],
+        ),
     ],
 )
 def test_examples_run_and_check_themselves(
