@@ -116,9 +116,14 @@ def unrolled_loss(
                 history = torch.cat([history[:, 1:], after[:, None]], dim=1)
         move = batch.moves[:, steps - 1]
         if return_steps is not None and steps > 1:
-            scene = batch.world.batch
-            truth = batch.history[:, -1] + batch.moves[:, : steps - 1].sum(1)
-            move = move - _scene_mean(history[:, -1] - truth, scene)[scene] / return_steps
+            scene, truth = (
+                batch.world.batch,
+                batch.history[:, -1] + batch.moves[:, : steps - 1].sum(1),
+            )
+            drift, of = history[:, -1] - truth, scene
+            if batch.moving is not None:
+                drift, of = drift[batch.moving], scene[batch.moving]
+            move = move - _scene_mean(drift, of)[scene] / return_steps
         return error(model.step(history, batch.world), move)
     total = batch.moves.new_zeros(())
     for k in range(steps):

@@ -31,19 +31,20 @@ def test_a_small_recipe_trains_on_its_own_kind_of_data(name, tmp_path):
             folder, family=family, count=2, seed=seed, spacing=recipe.model.spacing,
             frame_interval=recipe.model.dt, workers=1,
         )  # fmt: skip
-    short = {"train": folders[:1], "valid": folders[1:], "steps": 30, "statistics_windows": 16}
+    short = {"train": (folders[0],), "valid": (folders[1],), "steps": 40, "statistics_windows": 16}
     short |= {"valid_rollouts": 1, "valid_windows": 4}
-    trained = train(recipe.model_copy(update=short), tmp_path / "run")
+    short = recipe.model_copy(update=short)
+    train(short.model_copy(update={"steps": 1}), tmp_path / "run")
+    trained = train(short, tmp_path / "run")
     assert trained == tmp_path / "run" / "model"
     card = load_model(trained).card
-    assert card["trained_on"]["steps"] == 30
-    check = read_table(tmp_path / "run" / "validation.csv")[-1]
+    assert card["trained_on"]["steps"] in (1, 40)  # whichever scored better
+    first, check = read_table(tmp_path / "run" / "validation.csv")
     measures = {"energy", "centroid_travel"}
     measures |= {"upstream_depth"} if "barriers" in name else {"runout_max"}
     assert measures <= set(check)
     assert check["diverged"] == 0
-    # Thirty steps are enough to do better than a network that predicts nothing, whose loss is one.
-    assert check["one_step"] < 1
+    assert check["one_step"] < 0.98 * first["one_step"]
 
 
 @pytest.mark.parametrize(
