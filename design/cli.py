@@ -10,6 +10,7 @@ from typing import Annotated, Any, Optional
 
 import typer
 
+from design.calibrate import calibrate
 from design.evaluate import evaluate
 from design.options import (
     Device,
@@ -46,9 +47,64 @@ def optimize(
         typer.Option(help="How many baffles; default: as many as the scene has, or 3."),
     ] = None,
     budget: Annotated[
-        int,
-        typer.Option(help="Rollouts of the search; a gradient's backward pass counts as one too."),
-    ] = 48,
+        Optional[int],  # noqa: UP045
+        typer.Option(
+            help="Rollouts of the search; a gradient's backward pass counts as one too; default: "
+            "48, for each scenario.",
+            show_default=False,
+        ),
+    ] = None,
+    objectives: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            help="Two or more of runout, p99, depth and mass, such as runout,depth: search for "
+            "their Pareto front.",
+            show_default=False,
+        ),
+    ] = None,
+    scenarios: Annotated[
+        Optional[int],  # noqa: UP045
+        typer.Option(
+            help="Make the risk over so many flows small, drawn from the three ranges below.",
+            show_default=False,
+        ),
+    ] = None,
+    speed: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            help="Range of the release's speed [m/s]; default: 0.8 to 1.2 times the scene's.",
+            show_default=False,
+        ),
+    ] = None,
+    volume: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            help="Range of the volume, relative to the scene's; default: 0.8:1.2.",
+            show_default=False,
+        ),
+    ] = None,
+    friction: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            help="Range of the friction angle [degrees]; default: 5 less to 5 more than the "
+            "scene's. The default ranges keep to what a learned simulator was trained for.",
+            show_default=False,
+        ),
+    ] = None,
+    risk: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            help="mean of the scenarios' costs, or cvar: the mean of the worst; default: mean.",
+            show_default=False,
+        ),
+    ] = None,
+    cvar_level: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option(
+            help="Share of the scenarios that the CVaR leaves out, the best ones; default: 0.8.",
+            show_default=False,
+        ),
+    ] = None,
     verify: Annotated[
         int, typer.Option(help="How many of the best the reference solver judges; 0: none.")
     ] = 4,
@@ -88,10 +144,15 @@ def optimize(
         from gns_model.scene import Scene
 
         given = Scene.from_toml(scene)
+        from design.objectives import parse
         from design.run import Settings, optimise
+        from design.scenarios import scenarios_of
 
+        names = parse(objectives) if objectives is not None else ()
         settings = Settings(
             method=method,
+            objectives=names,
+            scenarios=scenarios_of(scenarios, speed, volume, friction, risk, cvar_level, seed),
             baffles=baffles,
             budget=budget,
             verify=verify,
@@ -114,6 +175,7 @@ def optimize(
 
 app.command()(evaluate)
 app.command()(report)
+app.command()(calibrate)
 
 
 def _show(summary: dict[str, Any], folder: Path) -> None:

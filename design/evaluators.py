@@ -9,18 +9,19 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from design.risk import MEAN, Flow, Risk, weigh
 from design.trials import Outcome
 from design.workers import Workers, as_completed
 from gns_env.objective import Objective
-from gns_env.task import BaffleTask
+from gns_env.task import BaffleTask, simulate
 from gns_model.scene import Scene
 from gns_model.simulator import Progress, Simulator, load_simulator
 from gns_model.trajectory import Trajectory
@@ -70,81 +71,98 @@ def differentiable(simulator: Simulator) -> bool:
 
 
 class InProcess:
-    """Runs all layouts of a call as one batch of `task`, in this process."""
+    """Runs all layouts of a call as one batch, in this process.
 
-    def __init__(self, task: BaffleTask) -> None:
-        self.task = task
-        self.differentiable = differentiable(task.simulator)
+    Args:
+        tasks: one task, or one for each scenario, of the same simulator and layouts.
+        risk: of their costs.
+    """
+
+    def __init__(self, tasks: BaffleTask | Sequence[BaffleTask], risk: Risk | None = None) -> None:
+        self.tasks = [tasks] if isinstance(tasks, BaffleTask) else list(tasks)
+        self.risk = risk or Risk()
+        self.differentiable = differentiable(self.tasks[0].simulator)
+
+    @property
+    def task(self) -> BaffleTask:
+        """The first task."""
+        return self.tasks[0]
 
     def evaluate(self, layouts: Sequence[np.ndarray]) -> Iterator[tuple[int, Outcome]]:
         """See `campaign.Evaluator`."""
-        yield from enumerate(run(self.task, layouts))
+        yield from enumerate(run(self.tasks, layouts, self.risk))
 
     def differentiate(self, layouts: Sequence[np.ndarray]) -> Iterator[tuple[int, Outcome]]:
         """See `campaign.Evaluator`."""
-        from design.gradient import differentiate
+        from design.gradient import differentiate_flows
 
-        yield from enumerate(differentiate(self.task, layouts))
+        yield from enumerate(differentiate_flows(self.tasks, layouts, self.risk))
 
 
 @dataclass(frozen=True)
 class TaskSpec:
-    """A BaffleTask as plain values, for another process to build.
+    """BaffleTasks as plain values, for another process to build: one for each scenario.
 
-    `reference` is a trajectory file: the scene without baffles by the same simulator, so that the
+    `references` are trajectory files: each scene without baffles by the same simulator, so that the
     workers need not all simulate it.
     """
 
-    scene: str
+    scenes: tuple[str, ...]
     n_baffles: int
-    objective: Objective
+    objectives: tuple[Objective, ...]
     simulator: SimulatorSpec
-    reference: Path
+    references: tuple[Path, ...]
+    risk: Risk = MEAN
 
     @classmethod
     def of(
         cls,
-        scene: Scene,
+        scenes: Sequence[Scene],
         n_baffles: int,
-        objective: Objective,
+        objectives: Sequence[Objective],
         simulator: SimulatorSpec,
-        reference: Path,
+        references: Sequence[Path],
+        risk: Risk | None = None,
     ) -> TaskSpec:
-        """The spec of a task on `scene`."""
-        return cls(json.dumps(scene.to_dict()), n_baffles, objective, simulator, reference)
+        """The spec of tasks on `scenes`."""
+        texts = tuple(json.dumps(scene.to_dict()) for scene in scenes)
+        return cls(
+            texts, n_baffles, tuple(objectives), simulator, tuple(references), risk or Risk()
+        )
 
-    def task(self) -> BaffleTask:
-        """The task; the same one within a process."""
-        return _task(self)
+    def tasks(self) -> list[BaffleTask]:
+        """The tasks; the same ones within a process."""
+        return _tasks(self)
 
 
 @lru_cache(maxsize=2)
-def _task(spec: TaskSpec) -> BaffleTask:
-    simulator = KnownReference(spec.simulator.load(), spec.reference)
-    return BaffleTask(
-        Scene.from_dict(json.loads(spec.scene)),
-        simulator,
-        n_baffles=spec.n_baffles,
-        objective=spec.objective,
+def _tasks(spec: TaskSpec) -> list[BaffleTask]:
+    scenes = [Scene.from_dict(json.loads(text)) for text in spec.scenes]
+    simulator = KnownReference(
+        spec.simulator.load(), dict(zip(scenes, spec.references, strict=True))
     )
+    return [
+        BaffleTask(scene, simulator, n_baffles=spec.n_baffles, objective=spec.objectives)
+        for scene in scenes
+    ]
 
 
 class KnownReference:
-    """A simulator whose rollout without baffles is already on file."""
+    """A simulator whose rollouts without baffles are already on file, by scene."""
 
-    def __init__(self, simulator: Simulator, reference: Path) -> None:
+    def __init__(self, simulator: Simulator, references: Mapping[Scene, Path]) -> None:
         self.name = simulator.name
-        self._simulator, self._reference = simulator, reference
+        self._simulator = simulator
+        self._references = {_flow(scene): path for scene, path in references.items()}
 
     def rollout(
         self, scenes: Sequence[Scene], *, progress: Progress | None = None
     ) -> list[Trajectory]:
-        """As the simulator's, but a scene without baffles comes from the file."""
-        given = [scene for scene in scenes if scene.baffles]
+        """As the simulator's, but a scene without baffles comes from its file."""
+        known = [None if s.baffles else self._references.get(_flow(s)) for s in scenes]
+        given = [scene for scene, path in zip(scenes, known, strict=True) if path is None]
         rolled = iter(self._simulator.rollout(given, progress=progress) if given else [])
-        return [
-            next(rolled) if scene.baffles else Trajectory.load(self._reference) for scene in scenes
-        ]
+        return [next(rolled) if path is None else Trajectory.load(path) for path in known]
 
     def check(self, scene: Scene) -> None:
         """As the simulator's."""
@@ -152,6 +170,12 @@ class KnownReference:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._simulator, name)
+
+
+def _flow(scene: Scene) -> str:
+    """What a rollout without baffles depends on; where baffles may stand does not count."""
+    values = scene.replace(placement=None, baffles=()).to_dict()
+    return json.dumps(values, sort_keys=True)
 
 
 class InWorkers:
@@ -179,28 +203,35 @@ class InWorkers:
             yield k, jobs[k].result()
 
 
-def run(task: BaffleTask, layouts: Sequence[np.ndarray]) -> list[Outcome]:
-    """One rollout of each layout [m], shape (n, D-1), as one batch."""
+def run(
+    tasks: Sequence[BaffleTask], layouts: Sequence[np.ndarray], risk: Risk | None = None
+) -> list[Outcome]:
+    """One rollout of each layout [m], shape (n, D-1), in each task, all as one batch."""
     started = time.perf_counter()
-    evaluations = task.evaluate(list(layouts))
+    asked = [(t, t.space.as_centres(layout)) for layout in layouts for t in tasks]
+    found = simulate(asked)
     seconds = (time.perf_counter() - started) / max(len(layouts), 1)
-    return [
-        Outcome(
-            cost=float(e.cost),
-            measures={} if e.failed else dict(e.measures),
-            status=e.status,
-            seconds=seconds,
-            costs=e.costs if len(e.costs) > 1 else (),
-        )
-        for e in evaluations
-    ]
+    outcomes = []
+    for k in range(0, len(asked), len(tasks)):
+        flows = []
+        for (task, centres), known in zip(asked[k : k + len(tasks)], found[k:], strict=False):
+            e = task.judge(centres, *known)
+            flows.append(Flow(e.status, dict(e.measures), e.costs))
+        outcome = weigh(flows, risk or Risk(), failure_cost(tasks[0].objectives))
+        outcomes.append(replace(outcome, seconds=seconds))
+    return outcomes
+
+
+def failure_cost(objectives: Sequence[Objective]) -> float:
+    """The cost of a rollout that failed, of the sum of several objectives."""
+    return sum(objective.failure_cost for objective in objectives)
 
 
 def _evaluate_job(spec: TaskSpec, layout: np.ndarray, slot: int) -> Outcome:
-    return run(spec.task(), [layout])[0]
+    return run(spec.tasks(), [layout], spec.risk)[0]
 
 
 def _differentiate_job(spec: TaskSpec, layout: np.ndarray, slot: int) -> Outcome:
-    from design.gradient import differentiate
+    from design.gradient import differentiate_flows
 
-    return differentiate(spec.task(), [layout])[0]
+    return differentiate_flows(spec.tasks(), [layout], spec.risk)[0]

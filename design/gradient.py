@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +19,7 @@ from numpy.typing import ArrayLike
 from design.baselines import engineering_layouts, random_layouts
 from design.campaign import Campaign
 from design.distinct import apart
+from design.risk import Flow, Risk, weigh
 from design.trials import Outcome
 from gns_env.layout import LayoutSpace
 from gns_env.task import BaffleTask
@@ -214,35 +216,51 @@ def differentiate(task: BaffleTask, layouts: Sequence[np.ndarray]) -> list[Outco
 
     The gradient is that of the smooth objective; cost and measures are hard, of the same rollout.
     """
-    import torch
+    return differentiate_flows([task], layouts, Risk())
 
+
+def differentiate_flows(
+    tasks: Sequence[BaffleTask], layouts: Sequence[np.ndarray], risk: Risk
+) -> list[Outcome]:
+    """One rollout and one backward pass of each layout in each task, one task a scenario.
+
+    Costs and gradients are the risk of those of the tasks: the hard costs say which flows count.
+    """
     started = time.perf_counter()
-    centres = [torch.tensor(np.asarray(c, dtype=np.float64), requires_grad=True) for c in layouts]
-    rollouts, costs = _smooth_costs(task, centres, ADJOINT_LIMIT)
-    costs.sum().backward()
+    found = [_differentiate(task, layouts) for task in tasks]
     seconds = (time.perf_counter() - started) / len(layouts)
+    failure = sum(objective.failure_cost for objective in tasks[0].objectives)
     outcomes = []
-    for positions, c in zip(rollouts, centres, strict=True):
-        gradient = c.grad.detach().cpu().numpy() if c.grad is not None else None
-        scene = task.scene_with(c.detach().numpy())
-        outcomes.append(_outcome(task, positions, scene, gradient, seconds))
+    for passes in zip(*found, strict=True):
+        outcome = weigh([flow for flow, _ in passes], risk, failure)
+        gradient = None
+        if outcome.status == OK:
+            shares = risk.weights([sum(flow.costs) for flow, _ in passes])
+            gradient = sum(w * g for w, (_, g) in zip(shares, passes, strict=True))
+        outcomes.append(replace(outcome, backwards=len(tasks), seconds=seconds, gradient=gradient))
     return outcomes
 
 
-def _outcome(
-    task: BaffleTask,
-    positions: Tensor,
-    scene: Scene,
-    gradient: np.ndarray | None,
-    seconds: float,
-) -> Outcome:
+def _differentiate(
+    task: BaffleTask, layouts: Sequence[np.ndarray]
+) -> list[tuple[Flow, np.ndarray | None]]:
+    import torch
+
+    centres = [torch.tensor(np.asarray(c, dtype=np.float64), requires_grad=True) for c in layouts]
+    rollouts, costs = _smooth_costs(task, centres, ADJOINT_LIMIT)
+    costs.sum().backward()
+    return [_flow(task, p, c) for p, c in zip(rollouts, centres, strict=True)]
+
+
+def _flow(task: BaffleTask, positions: Tensor, centres: Tensor) -> tuple[Flow, np.ndarray | None]:
+    """What the rollout (T, N, D) gave by hard measures, and the gradient (n, D-1)."""
     config = task.simulator.config  # type: ignore[attr-defined]
+    scene = task.scene_with(centres.detach().numpy())
+    gradient = centres.grad.numpy() if centres.grad is not None else None
     frames = positions.detach().cpu().numpy()
-    sane = gradient is not None and np.isfinite(gradient).all() and _plausible(frames, scene)
-    if not sane:
-        return Outcome(
-            task.objective.failure_cost, {}, DIVERGED, rollouts=1, backwards=1, seconds=seconds
-        )
+    if gradient is None or not np.isfinite(gradient).all() or not _plausible(frames, scene):
+        costs = tuple(objective.failure_cost for objective in task.objectives)
+        return Flow(DIVERGED, {}, costs), None
     trajectory = Trajectory(
         positions=frames,
         time=np.arange(len(frames)) * config.dt,
@@ -251,9 +269,8 @@ def _outcome(
         point_volume=config.spacing**scene.dim,
         simulator=task.simulator.name,
     )
-    values = hard.summary(trajectory)
-    cost = task.objective.cost(values, task.reference)
-    return Outcome(cost, values, OK, rollouts=1, backwards=1, seconds=seconds, gradient=gradient)
+    flow = Flow.of(OK, hard.summary(trajectory), task.reference, task.objectives)
+    return flow, gradient
 
 
 def _plausible(frames: np.ndarray, scene: Scene) -> bool:

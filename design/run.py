@@ -3,7 +3,9 @@
     summary.json       what was found, in numbers; written again after every stage
     scene.toml         the scene that was given
     trials.csv         every trial; study.db holds the same as an Optuna study
-    layouts/           best.toml, rank-2.toml, ...; best.stl and best.glb
+    layouts/           best.toml, rank-2.toml, ...; best.stl and best.glb; with several objectives
+                       front-01.toml, ... for every point of the Pareto front
+    front.csv          with several objectives: the front as a table
     trajectories/      {best,paper,none}-{mpm,learned}.h5: by the reference solver and by the
                        simulator that searched
     rollouts/          what a rerun with --resume finds again
@@ -23,16 +25,20 @@ import socket
 import time
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from design.campaign import Campaign, Evaluator
-from design.evaluators import InProcess, InWorkers, KnownReference, SimulatorSpec, TaskSpec
+from design.evaluators import InProcess, InWorkers, SimulatorSpec, TaskSpec, failure_cost
 from design.evaluators import differentiable as has_gradient
+from design.front import front_entries, write_front
 from design.methods import METHODS, choose
+from design.pareto import front, spread
+from design.risk import Flow, weigh
+from design.scenarios import Scenarios, scenes, widest
 from design.settings import Settings
 from design.store import Pending, Rolled, RolloutStore, Watch
 from design.summary import (
@@ -46,12 +52,12 @@ from design.summary import (
     write_trials,
 )
 from design.trials import Outcome, StudyError, Trial, TrialLog, sqlite_url, storage_errors
-from design.verify import Judged, candidates, rank
+from design.verify import Judged, as_judged, candidates, rank
 from design.workers import Workers, default_count
 from gns_env.layout import LayoutSpace
-from gns_env.task import BaffleTask
+from gns_env.scenario import Scenario
 from gns_model.console import progress_bar
-from gns_model.errors import SimulatorError
+from gns_model.errors import SceneError, SimulatorError
 from gns_model.particles import fill
 from gns_model.scene import Scene
 
@@ -117,11 +123,24 @@ class Run:
         self.summary: dict[str, Any] = {}
         self.reference_rollouts = 0
         self.baffles = settings.baffles or len(scene.baffles) or 3
-        self.space = LayoutSpace(scene, self.baffles)
+        self.drawn: list[Scenario] = []
+        self.notes: list[str] = []
+        flows = [scene.with_baffles([])]
+        if settings.scenarios:
+            self.drawn, self.notes = settings.scenarios.draw(scene, settings.simulator.load())
+            flows = scenes(scene, self.drawn)
+        # What is clear of the largest release is clear of all.
+        largest = widest(flows).replace(baffles=scene.baffles, placement=scene.placement)
+        self.space = LayoutSpace(largest, self.baffles)
+        #: The scene without baffles, and each flow on it that a layout has to stand.
         self.bare = scene.replace(baffles=(), placement=self.space.placement)
-        self.notes = _check(scene, settings)
+        self.flows = [flow.replace(placement=self.space.placement) for flow in flows]
+        self.notes += _check([scene, *self.flows] if self.drawn else [scene], settings)
         self.method = choose(
-            settings.method, has_gradient(settings.simulator.load()), 1, settings.simulator.name
+            settings.method,
+            has_gradient(settings.simulator.load()),
+            len(settings.parts),
+            settings.simulator.name,
         )
         of_use = max(settings.batch, settings.verify + 2)
         self.workers = settings.workers or max(1, min(default_count(), of_use))
@@ -149,17 +168,28 @@ class Run:
                 f"{self.out} already holds a run: go on with --resume, or choose another --out"
             )
         self.out.mkdir(parents=True, exist_ok=True)
-        task = {
+        task: dict[str, Any] = {
             "scene": self.bare.to_dict(),
             "number of baffles": self.baffles,
             "objective": asdict(s.objective),
             "simulator": s.simulator.describe(),
         }
+        if s.objectives:
+            task["set of objectives"] = list(s.objectives)
+        if s.scenarios:
+            task["set of scenarios"] = [asdict(flow) for flow in self.drawn]
+            task["risk"] = asdict(s.risk)
         # A storage that is shared holds many studies: the task tells them apart.
         digest = hashlib.sha256(json.dumps(task, sort_keys=True).encode()).hexdigest()[:8]
         name = f"{self.scene.name}-{digest}" if s.storage else "gns-design"
         self._log = TrialLog.open(
-            self.storage, name, self.space, task, resume=s.resume, owned=s.storage is None
+            self.storage,
+            name,
+            self.space,
+            task,
+            resume=s.resume,
+            owned=s.storage is None,
+            objectives=len(s.parts),
         )
         self.scene.to_toml(self.out / "scene.toml")
 
@@ -170,18 +200,18 @@ class Run:
         searched = self._references(store, s.simulator)
         verified = self._references(store, s.verifier) if s.verify else {}
         watch = Watch(bar)
-        watch.add("search: no baffles, own layout", list(searched.values()))
-        watch.add("verify: no baffles, own layout", list(verified.values()))
+        watch.add("search: no baffles, own layout", [p for ps in searched.values() for p in ps])
+        watch.add("verify: no baffles, own layout", [p for ps in verified.values() for p in ps])
 
         with self._timed("search"):
-            reference = self._take_in(searched, watch)
-            self._search(workers, reference, watch)
+            references = self._take_in(searched, watch)
+            self._search(workers, references, watch)
         self.write(PARTIAL)
         with self._timed("verify"):
             if s.verify:
                 self._verify(store, verified, watch)
             else:
-                self.ranked = self._candidates(1)
+                self.ranked = rank(self._candidates(1))
         with self._timed("trajectories"):
             self._name_trajectories(store, searched, verified)
         self.write(COMPLETE)
@@ -208,6 +238,7 @@ class Run:
         self.summary = {
             "status": status,
             **results(ranked, self.paper, self.none, trials, s.objective),
+            **self._several(trials),
             "reference_rollouts": self.reference_rollouts,
             "seconds": {k: round(v, 2) for k, v in {**self.seconds, "total": total}.items()},
             "notes": self.notes,
@@ -216,7 +247,7 @@ class Run:
                 "scene": self.scene.name,
                 "method": self.method,
                 "baffles": self.baffles,
-                "budget": s.budget,
+                "budget": s.passes,
                 "verify": s.verify,
                 "seed": s.seed,
                 "batch": s.batch,
@@ -224,6 +255,8 @@ class Run:
                 "simulator": {**s.simulator.describe(), "device": s.simulator.device},
                 "verify_with": s.verifier.describe(),
                 "objective": {**asdict(s.objective), "text": str(s.objective)},
+                **({"objectives": ",".join(s.objectives)} if s.objectives else {}),
+                **({"scenarios": _described(s.scenarios)} if s.scenarios else {}),
                 "storage": self.storage.rsplit("@", 1)[-1],
             },
             "versions": versions(),
@@ -231,129 +264,187 @@ class Run:
         write_summary(self.out, self.summary)
         write_trials(self.out, self.log)
         write_layouts(self.out, self.bare, ranked)
+        if s.objectives:
+            write_front(self.out, self.bare, self.summary["front"])
+
+    def _several(self, trials: Sequence[Trial]) -> dict[str, Any]:
+        """What summary.json says of several objectives and of several flows."""
+        s = self.settings
+        found: dict[str, Any] = {}
+        if s.objectives:
+            found["objectives"] = [str(part) for part in s.parts]
+            found["front"] = front_entries(front(trials), s.parts, s.objectives, self.ranked)
+        if s.scenarios:
+            found["risk"] = str(s.risk)
+            found["scenarios"] = [asdict(flow) for flow in self.drawn]
+        return found
 
     # -- what the stages do --------------------------------------------------------------------
 
-    def _references(self, store: RolloutStore, spec: SimulatorSpec) -> dict[str, Pending]:
-        scenes = {"none": self.bare}
+    def _references(self, store: RolloutStore, spec: SimulatorSpec) -> dict[str, list[Pending]]:
+        """Rollouts of no baffles and of the scene's own layout, one in each flow."""
+        alone = not self.drawn
+        found = {}
+        found["none"] = [
+            store.start(spec, flow, trajectory=alone or spec == self.settings.simulator)
+            for flow in self.flows
+        ]
         if self.scene.baffles:
-            scenes["paper"] = self.scene.replace(placement=self.space.placement)
-        return {key: store.start(spec, scene) for key, scene in scenes.items()}
+            try:
+                own = [self._own(flow) for flow in self.flows]
+            except SceneError as error:
+                self._note(f"the scene's own layout does not stand in every scenario: {error}")
+            else:
+                found["paper"] = [store.start(spec, flow, trajectory=alone) for flow in own]
+        return found
 
-    def _take_in(self, searched: dict[str, Pending], watch: Watch) -> Rolled:
+    def _own(self, flow: Scene) -> Scene:
+        """A flow with the scene's own layout.
+
+        Raises:
+            SceneError: if a release of the flow reaches a baffle.
+        """
+        return flow.replace(baffles=self.scene.baffles)
+
+    def _note(self, line: str) -> None:
+        if line not in self.notes:
+            self.notes.append(line)
+
+    def _weigh(self, rolled: Sequence[Rolled], none: Sequence[Rolled]) -> Outcome:
+        """One layout in all flows, relative to no baffles in each."""
+        s = self.settings
+        flows = [
+            Flow.of(r.status, r.measures, n.measures, s.parts)
+            for r, n in zip(rolled, none, strict=True)
+        ]
+        return weigh(flows, s.risk, failure_cost(s.parts))
+
+    def _take_in(self, searched: dict[str, list[Pending]], watch: Watch) -> list[Rolled]:
         """What the search's simulator says of no baffles and of the scene's own layout."""
-        by = self.settings.objective
-        watch.wait(list(searched.values()))
-        none = searched["none"].result()
-        if none.status != "ok":
-            raise SimulatorError(
-                f"the rollout of {self.settings.simulator.name} without baffles ended as "
-                f"{none.status!r}, so no cost can be relative to it"
-            )
+        watch.wait([p for pending in searched.values() for p in pending])
+        none = [p.result() for p in searched["none"]]
+        for rolled in none:
+            if rolled.status != "ok":
+                raise SimulatorError(
+                    f"the rollout of {self.settings.simulator.name} without baffles ended as "
+                    f"{rolled.status!r}, so no cost can be relative to it"
+                )
         empty = np.zeros((0, self.scene.dim - 1))
-        cost = by.cost(none.measures, none.measures)
-        self.none = Judged("none", empty, none.measures, cost)
+        self.none = as_judged(Trial(-1, "none", empty, self._weigh(none, none)))
         if "paper" in searched:
-            own = searched["paper"].result()
-            ok = own.status == "ok"
-            self.paper = Judged(
-                "scene",
-                np.array([baffle.center for baffle in self.scene.baffles], dtype=float),
-                own.measures if ok else {},
-                by.cost(own.measures, none.measures) if ok else by.failure_cost,
-            )
-            self._log_own_layout(own)
+            own = [p.result() for p in searched["paper"]]
+            centres = np.array([baffle.center for baffle in self.scene.baffles], dtype=float)
+            seconds = sum(r.seconds for r in own)
+            outcome = replace(self._weigh(own, none), seconds=seconds)
+            self.paper = as_judged(Trial(-1, "scene", centres, outcome))
+            self._log_own_layout(centres, outcome)
         return none
 
-    def _log_own_layout(self, rolled: Rolled) -> None:
+    def _log_own_layout(self, centres: np.ndarray, outcome: Outcome) -> None:
         """The scene's own layout is a trial too, where the search could have proposed it."""
-        own = self.paper
-        assert own is not None and own.cost is not None  # noqa: PT018
         same_size = all(np.allclose(b.size, self.space.size) for b in self.scene.baffles)
-        if len(own.centres) != self.baffles or not same_size or self.space.check(own.centres):
+        if len(centres) != self.baffles or not same_size or self.space.check(centres):
             return
         if not any(trial.origin == "scene" for trial in self.log.trials()):
-            outcome = Outcome(own.cost, own.surrogate, rolled.status, seconds=rolled.seconds)
-            self.log.add("scene", own.centres, outcome)
+            self.log.add("scene", centres, outcome)
 
-    def _search(self, workers: Workers, reference: Rolled, watch: Watch) -> None:
+    def _search(self, workers: Workers, references: Sequence[Rolled], watch: Watch) -> None:
         s, log = self.settings, self.log
-        best = log.best()
-        lowest = best.cost if best else float("inf")
+        tried = [t for t in log.trials() if t.ok]
         bar = watch.bar
-        task = bar.add_task(f"search: {self.method}", total=s.budget, completed=log.spent())
+        title = f"search: {self.method}"
+        task = bar.add_task(title, total=s.passes, completed=log.spent())
 
         def on_trial(trial: Trial) -> None:
-            nonlocal lowest
-            lowest = min(lowest, trial.cost)
-            bar.update(task, description=f"search: {self.method}, best {lowest:.4f}")
+            if trial.ok:
+                # Only what may be best or on the front has to be remembered.
+                tried[:] = front([*tried, trial]) if s.objectives else [*tried, trial]
+                said = f"best {min(t.cost for t in tried):.4f}"
+                said = f"front of {len(tried)}, {said}" if s.objectives else said
+                bar.update(task, description=f"{title}, {said}")
             bar.advance(task, trial.outcome.rollouts + trial.outcome.backwards)
 
         METHODS[self.method](
             Campaign(
                 log=log,
-                evaluator=self._evaluator(workers, reference.path, watch),
-                budget=s.budget,
+                evaluator=self._evaluator(workers, [r.path for r in references], watch),
+                budget=s.passes,
                 seed=s.seed,
                 batch=s.batch,
                 on_trial=on_trial,
                 salt=_salt() if s.storage else 0,
+                price=s.flows,
             )
         )
 
-    def _evaluator(self, workers: Workers, reference: Path, watch: Watch) -> Evaluator:
+    def _evaluator(self, workers: Workers, references: list[Path], watch: Watch) -> Evaluator:
         s = self.settings
+        spec = TaskSpec.of(self.flows, self.baffles, s.parts, s.simulator, references, s.risk)
         if s.simulator.device != "cpu":
-            simulator = KnownReference(s.simulator.load(), reference)
-            return InProcess(
-                BaffleTask(self.bare, simulator, n_baffles=self.baffles, objective=s.objective)
-            )
-        spec = TaskSpec.of(self.bare, self.baffles, s.objective, s.simulator, reference)
+            return InProcess(spec.tasks(), s.risk)
         return InWorkers(workers, spec, watch.update)
 
     def _candidates(self, count: int) -> list[Judged]:
+        if self.settings.objectives:
+            return [as_judged(t) for t in spread(front(self.log.trials()), count)]
         # Closer than a third of a baffle is one design.
         least = float(min(self.space.size[[0, *range(2, self.scene.dim)]])) / 3
         own = [] if self.paper is None else [self.paper.centres]
         return candidates(self.log.trials(), count, least, avoid=own)
 
-    def _verify(self, store: RolloutStore, references: dict[str, Pending], watch: Watch) -> None:
+    def _verify(
+        self, store: RolloutStore, references: dict[str, list[Pending]], watch: Watch
+    ) -> None:
         s = self.settings
         chosen = self._candidates(s.verify)
-        scenes = [self.bare.with_baffles(judged.centres) for judged in chosen]
-        pending = [store.start(s.verifier, scene, trajectory=False) for scene in scenes]
-        watch.add(f"verify: best {len(chosen)}", pending)
-        watch.wait([*references.values(), *pending])
-        none = references["none"].result()
-        if none.status != "ok":
-            raise SimulatorError(
-                f"the reference rollout without baffles ended as {none.status!r}: nothing can be "
-                "verified"
-            )
+        pending = [
+            [
+                store.start(s.verifier, flow.with_baffles(layout.centres), trajectory=False)
+                for flow in self.flows
+            ]
+            for layout in chosen
+        ]
+        started = [p for ps in pending for p in ps]
+        watch.add(f"verify: best {len(chosen)}", started)
+        watch.wait([*(p for ps in references.values() for p in ps), *started])
+        none = [p.result() for p in references["none"]]
+        for rolled in none:
+            if rolled.status != "ok":
+                raise SimulatorError(
+                    f"the reference rollout without baffles ended as {rolled.status!r}: nothing "
+                    "can be verified"
+                )
         judged = [(self.none, references["none"]), (self.paper, references.get("paper"))]
-        for layout, job in (*judged, *zip(chosen, pending, strict=True)):
-            if layout is not None and job is not None:
-                done = job.result()
-                layout.judge(done.status, done.measures, none.measures, s.objective)
-        self.reference_rollouts = len(pending) + len(references)
+        for layout, jobs in (*judged, *zip(chosen, pending, strict=True)):
+            if layout is not None and jobs is not None:
+                layout.take(self._weigh([job.result() for job in jobs], none))
+        self.reference_rollouts = len(started) + sum(map(len, references.values()))
         self.ranked = rank(chosen)
 
     def _name_trajectories(
         self,
         store: RolloutStore,
-        searched: dict[str, Pending],
-        verified: dict[str, Pending],
+        searched: dict[str, list[Pending]],
+        verified: dict[str, list[Pending]],
     ) -> None:
+        """Name what a reader looks at: the scene's own flow, also of a robust design."""
         s = self.settings
-        roles = {"learned": (s.simulator, dict(searched)), "mpm": (s.verifier, dict(verified))}
-        if self.ranked:
-            best = self.bare.with_baffles(self.ranked[0].centres)
-            for spec, pending in roles.values():
-                if pending:
-                    pending["best"] = store.start(spec, best)
-        named = set()
-        for role, (_, pending) in roles.items():
-            for key, job in pending.items():
+        named = {p.result().path for p in searched["none"]}  # a resumed search reads them
+        for role, spec, known in (
+            ("learned", s.simulator, searched),
+            ("mpm", s.verifier, verified),
+        ):
+            if not known:
+                continue
+            shown = {key: pending[0] for key, pending in known.items()}
+            if self.drawn:
+                shown = {"none": store.start(spec, self.bare)}
+                if self.scene.baffles:
+                    shown["paper"] = store.start(spec, self._own(self.bare))
+            if self.ranked:
+                best = self.bare.with_baffles(self.ranked[0].centres)
+                shown["best"] = store.start(spec, best)
+            for key, job in shown.items():
                 rolled = job.result()
                 store.name(rolled, f"{key}-{role}")
                 named.add(rolled.path)
@@ -368,19 +459,31 @@ class Run:
             self.seconds[stage] = time.perf_counter() - started
 
 
-def _check(scene: Scene, settings: Settings) -> list[str]:
-    """Refuse what the simulators cannot run; return what they warn of."""
+def _check(flows: Sequence[Scene], settings: Settings) -> list[str]:
+    """Refuse what the simulators cannot run; return what they warn of, each limit once."""
     notes = []
     for spec in (settings.simulator, *([settings.verifier] if settings.verify else [])):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             simulator = spec.load()
-            simulator.check(scene)
-            spacing = getattr(simulator, "spacing", None)
-            if spacing is not None:
-                fill(scene, spacing)  # a release thinner than that: say so before the search
+            for scene in flows:
+                simulator.check(scene)
+                spacing = getattr(simulator, "spacing", None)
+                if spacing is not None:
+                    fill(scene, spacing)  # a release thinner than that: say so before the search
         notes += [str(warning.message) for warning in caught]
     return notes
+
+
+def _described(scenarios: Scenarios) -> dict[str, Any]:
+    """The options that drew the scenarios, as words for the same command."""
+    ranges = {name: getattr(scenarios, name) for name in ("speed", "volume", "friction")}
+    return {
+        "count": scenarios.count,
+        **{name: f"{r[0]:g}:{r[1]:g}" for name, r in ranges.items() if r is not None},
+        "risk": scenarios.risk.kind,
+        **({"level": scenarios.risk.level} if scenarios.risk.kind == "cvar" else {}),
+    }
 
 
 def _salt() -> int:

@@ -6,8 +6,14 @@ from dataclasses import dataclass, field
 
 from design.evaluators import SimulatorSpec
 from design.methods import METHODS
+from design.objectives import joined, split
+from design.risk import Risk
+from design.scenarios import Scenarios
 from gns_env.objective import Objective
 from gns_model.errors import GnsError
+
+#: Layouts of a search that is given no budget; a gradient counts twice.
+DEFAULT_BUDGET = 48
 
 
 class SettingError(GnsError, ValueError):
@@ -21,11 +27,14 @@ class Settings:
     Attributes:
         method: a key of `methods.METHODS`; None: hybrid where the simulator has a gradient.
         baffles: how many; None: as many as the scene has, or 3.
-        budget: passes through a rollout that the search may spend.
+        budget: passes through a rollout that the search may spend; None: 48 for each scenario.
         verify: how many of the best layouts the reference solver judges; 0: none at all.
         seed: of everything random.
         simulator, verifier: who searches and who judges.
-        objective: what to make small.
+        objective: what to make small; with `objectives`, the sum of those, which says what point of
+            the front is recommended.
+        objectives: names of `objectives.NAMES` for a Pareto front; none: one objective.
+        scenarios: the flows that a layout has to stand; None: the scene's own.
         storage: Optuna storage address; None: SQLite in the run folder.
         resume: go on with what the run folder and the storage hold.
         workers: processes of one thread; None: one a core, as many as are of use.
@@ -37,12 +46,14 @@ class Settings:
 
     method: str | None = None
     baffles: int | None = None
-    budget: int = 48
+    budget: int | None = None
     verify: int = 4
     seed: int = 0
     simulator: SimulatorSpec = field(default_factory=lambda: SimulatorSpec("baffle-lite"))
     verifier: SimulatorSpec = field(default_factory=lambda: SimulatorSpec("mpm"))
     objective: Objective = field(default_factory=Objective)
+    objectives: tuple[str, ...] = ()
+    scenarios: Scenarios | None = None
     storage: str | None = None
     resume: bool = False
     workers: int | None = None
@@ -54,5 +65,32 @@ class Settings:
             value = getattr(self, name)
             if value is not None and value < bound:
                 raise SettingError(f"{name} must be {bound} or more, got {value}")
+        if self.budget is not None and self.budget < self.flows:
+            raise SettingError(
+                f"budget must be {self.flows} or more, a rollout for each scenario, got "
+                f"{self.budget}"
+            )
+        if self.objectives:
+            object.__setattr__(self, "objective", joined(self.parts))
         if self.method is not None and self.method not in METHODS:
             raise SettingError(f"no method {self.method!r}: give {', '.join(METHODS)}")
+
+    @property
+    def parts(self) -> tuple[Objective, ...]:
+        """Every objective apart."""
+        return split(self.objectives, self.objective) if self.objectives else (self.objective,)
+
+    @property
+    def flows(self) -> int:
+        """Rollouts that one layout takes."""
+        return self.scenarios.count if self.scenarios else 1
+
+    @property
+    def passes(self) -> int:
+        """The budget in rollouts."""
+        return DEFAULT_BUDGET * self.flows if self.budget is None else self.budget
+
+    @property
+    def risk(self) -> Risk:
+        """Of the costs in several flows."""
+        return self.scenarios.risk if self.scenarios else Risk()

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from design.distinct import apart
-from design.trials import Trial
-from gns_env.objective import Objective
+from design.trials import Outcome, Trial
 
 
 @dataclass
@@ -28,6 +27,8 @@ class Judged:
         surrogate, verified: hard measures by the search's simulator and by the reference solver;
             empty where that one has not run or has failed.
         cost, verified_cost: the objective by each, relative to its own rollout without baffles.
+        costs, verified_costs: the same by objective, of a search with several.
+        flows, verified_flows: the same by scenario, of a robust search.
     """
 
     origin: str
@@ -37,20 +38,25 @@ class Judged:
     verified: dict[str, float] | None = None
     verified_cost: float | None = None
     verified_status: str | None = None
+    costs: tuple[float, ...] = ()
+    verified_costs: tuple[float, ...] = ()
+    flows: tuple[float, ...] = ()
+    verified_flows: tuple[float, ...] = ()
 
-    def judge(
-        self, status: str, verified: dict[str, float], reference: dict[str, float], by: Objective
-    ) -> None:
-        """Take in what the reference solver says."""
-        self.verified_status = status
-        if status == "ok":
-            self.verified = verified
-            self.verified_cost = by.cost(verified, reference)
-        else:
-            self.verified_cost = by.failure_cost
+    def take(self, outcome: Outcome) -> None:
+        """Take in what the reference solver says of all flows."""
+        self.verified_status, self.verified_cost = outcome.status, outcome.cost
+        if outcome.status == "ok":
+            self.verified = outcome.measures
+            self.verified_costs, self.verified_flows = outcome.costs, outcome.flows
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for summary.json."""
+        several = {
+            name: list(getattr(self, name))
+            for name in ("costs", "verified_costs", "flows", "verified_flows")
+            if getattr(self, name)
+        }
         return {
             "layout": np.round(self.centres, 6).tolist(),
             "origin": self.origin,
@@ -59,6 +65,7 @@ class Judged:
             "verified_cost": self.verified_cost,
             "verified": self.verified,
             "verified_status": self.verified_status,
+            **several,
         }
 
 
@@ -72,10 +79,15 @@ def candidates(
     ranked = sorted((t for t in trials if t.ok), key=lambda t: (t.cost, t.number))
     chosen = apart([t.centres for t in ranked], least, count, avoid=avoid)
     by_layout = {id(t.centres): t for t in ranked}
-    return [
-        Judged(t.origin, t.centres, dict(t.outcome.measures), t.cost)
-        for t in (by_layout[id(c)] for c in chosen)
-    ]
+    return [as_judged(by_layout[id(c)]) for c in chosen]
+
+
+def as_judged(trial: Trial) -> Judged:
+    """A trial as what the reference solver has not seen yet."""
+    o = trial.outcome
+    return Judged(
+        trial.origin, trial.centres, dict(o.measures), o.cost, costs=o.costs, flows=o.flows
+    )
 
 
 def rank(judged: Sequence[Judged]) -> list[Judged]:

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from design.risk import Flow, Risk, weigh
 from design.trials import Outcome, Trial
 from design.verify import Judged, candidates, gap, rank, spearman, verdict
 from gns_env.objective import Objective
@@ -18,7 +19,8 @@ def judged(cost, travel, *, origin="bayes", status="ok", shift=0.0):
     """A layout that the search thinks costs `cost` and whose verified travel is `travel`."""
     j = Judged(origin, LAYOUT + shift, {"centroid_travel": 0.6, "upstream_depth": 0.2}, cost)
     verified = {"centroid_travel": travel, "upstream_depth": 0.2}
-    j.judge(status, verified, NONE, Objective(depth_weight=0.25))
+    by = Objective(depth_weight=0.25)
+    j.take(weigh([Flow.of(status, verified, NONE, [by])], Risk(), by.failure_cost))
     return j
 
 
