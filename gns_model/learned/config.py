@@ -131,6 +131,11 @@ class ModelConfig(BaseModel):
     #: Push points out of the boxes and into the domain after every step.
     project: bool = True
 
+    #: First steps of a rollout that the reference solver takes. A column that was just let go is a
+    #: perfect lattice at rest: how it will start follows from faces that lie many neighbours away,
+    #: while one step later velocities tell. The paper's rollouts begin with six frames of its MPM.
+    solver_steps: Annotated[int, Field(ge=0)] = 0
+
     types: Annotated[int, Field(ge=0)] = 0  #: number of particle types to embed; 0: none
     type_embedding: Annotated[int, Field(ge=1)] = 16
     #: Properties of the scene that every vertex sees, in this order.
@@ -146,6 +151,8 @@ class ModelConfig(BaseModel):
     def _consistent(self) -> ModelConfig:
         if self.baffles == "points" and self.types == 0:
             raise ValueError('baffles = "points" needs types > 0 to tell them from moving points')
+        if self.solver_steps and self.subcells > 1:
+            raise ValueError("solver_steps needs the solver's own points: subcells = 1")
         if self.radius <= self.spacing:
             raise ValueError(
                 f"radius {self.radius:g} m must exceed the spacing {self.spacing:g} m, "

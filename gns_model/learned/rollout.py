@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -12,19 +11,14 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint as rematerialise
 
-from gns_model.learned.config import ModelConfig
+from gns_model.errors import SimulatorError
 from gns_model.learned.divergence import astray, speed_limit
 from gns_model.learned.model import LearnedModel
-from gns_model.learned.start import Start, launched, start
+from gns_model.learned.start import Start, frame_count, launched, start
 from gns_model.learned.world import World
 from gns_model.particles import Points
 from gns_model.scene import Scene
 from gns_model.simulator import Progress
-
-
-def frame_count(config: ModelConfig, scene: Scene) -> int:
-    """Number of frames of a rollout of `scene`, the start included."""
-    return 1 + max(1, math.floor(scene.duration / config.dt + 1e-6))
 
 
 @torch.inference_mode()
@@ -49,13 +43,16 @@ def roll_out(
     ]
     diverged: dict[int, int] = {}
     for found, begin in zip(out, starts, strict=True):
-        found[0] = begin.history[: begin.rows, -1].cpu().numpy()
+        found[: len(begin.known)] = begin.known.cpu().numpy()
     longest = torch.tensor([speed_limit(s) * config.dt for s in scenes], **place(model))
 
-    running = list(range(len(scenes)))
-    window = torch.cat([s.history for s in starts])
-    world = _world(scenes, starts, model)
-    for frame in range(1, max(frames)):
+    running = [k for k, s in enumerate(starts) if frames[k] > len(s.known)]
+    if not running:
+        advance(1.0)
+        return out, diverged
+    window = torch.cat([starts[k].history for k in running])
+    world = _world([scenes[k] for k in running], [starts[k] for k in running], model)
+    for frame in range(len(starts[running[0]].known), max(frames)):
         after = model.step(window, world)
         bad = astray(window[:, -1], after, world, longest[running])
         window = torch.cat([window[:, 1:], after[:, None]], dim=1)
@@ -149,8 +146,13 @@ def roll_out_tensor(
     def step(*past: Tensor) -> Tensor:
         return model.step(torch.stack(past, dim=1), world)
 
+    begun = len(starts[0].known)
+    if any(len(s.known) != begun for s in starts) or min(lengths) < begun:
+        raise SimulatorError(
+            f"the first {model.config.solver_steps} steps are the solver's: no scene may be shorter"
+        )
     track = list(torch.cat(histories).unbind(1))
-    for _ in range(1, max(lengths)):
+    for _ in range(begun, max(lengths)):
         past = track[-depth:]
         if checkpoint and torch.is_grad_enabled():
             track.append(rematerialise(step, *past, use_reentrant=False))
@@ -158,7 +160,12 @@ def roll_out_tensor(
             track.append(step(*past))
         if limit is not None:
             track[-1] = LimitAdjoint.apply(track[-1], [len(h) for h in histories], limit)
-    whole = torch.stack(track[depth - 1 :])
+    # Kinematic points stand still, so any frame of theirs will do for the first ones.
+    first = [
+        torch.cat([s.known, h[s.rows :, -1].expand(begun, -1, -1)], 1)[:-1]
+        for s, h in zip(starts, histories, strict=True)
+    ]
+    whole = torch.cat([torch.cat(first, dim=1), torch.stack(track[depth - 1 :])])
     parts = whole.split([len(h) for h in histories], dim=1)
     return [p[:t, :n] for p, t, n in zip(parts, lengths, moving, strict=True)]
 

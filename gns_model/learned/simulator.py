@@ -16,8 +16,8 @@ from torch import Tensor
 from gns_model.errors import SimulatorError
 from gns_model.learned.model import LearnedModel
 from gns_model.learned.predict import Array, Bounds, predict_positions
-from gns_model.learned.rollout import frame_count, place, roll_out, roll_out_tensor
-from gns_model.learned.start import Start, start
+from gns_model.learned.rollout import place, roll_out, roll_out_tensor
+from gns_model.learned.start import Start, frame_count, start
 from gns_model.particles import MOVING, Points, fill, scatter
 from gns_model.scene import Scene
 from gns_model.simulator import Progress

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from gns_model.errors import SimulatorError
 from gns_model.learned.config import ModelConfig
 from gns_model.learned.world import baffle_boxes, baffle_points
 from gns_model.particles import MOVING, STATIONARY, Points
@@ -24,12 +26,20 @@ class Start:
         rows: how many of the points, from the first, the trajectory is about. Kinematic points
             that stand for baffles of the scene come after them.
         tan_friction: of every point, shape (N,), where it is not the scene's.
+        before: frames of the trajectory that are known already, the last of which ends `history`:
+            positions [m], shape (K, rows, D); K = 1 where the rollout begins at t = 0.
     """
 
     history: Tensor
     particle_type: Tensor
     rows: int
     tan_friction: Tensor | None = None
+    before: Tensor | None = None
+
+    @property
+    def known(self) -> Tensor:
+        """`before`; the current positions where there is none."""
+        return self.history[: self.rows, -1][None] if self.before is None else self.before
 
 
 def start(
@@ -44,7 +54,9 @@ def start(
     """Every scene at t = 0.
 
     Before its release the mass moved as it moves at the release: the history is that motion
-    extended backwards. Kinematic points, if the model wants them, come after the moving ones.
+    extended backwards. Kinematic points, if the model wants them, come after the moving ones. Where
+    the model leaves its first steps to the reference solver (`solver_steps`), they are part of the
+    history, too.
 
     Args:
         points: the moving points of each scene, at the spacing of the model.
@@ -56,6 +68,12 @@ def start(
         position = torch.tensor(begin.positions, dtype=dtype, device=device)
         velocity = torch.tensor(begin.velocities, dtype=dtype, device=device)
         history = position[:, None] - velocity[:, None] * (past * config.dt)[:, None]
+        before = None
+        if config.solver_steps:
+            solved = solver_frames(config, scene).to(position)
+            before = solved[: frame_count(config, scene)]
+            history = torch.cat([history[:, :-1], before.transpose(0, 1)], dim=1)
+            history = history[:, -len(past) :]
         kind = torch.full((len(position),), MOVING, device=device)
         if config.baffles == "points":
             own = centres[k] if centres is not None else None
@@ -63,15 +81,37 @@ def start(
             fixed = baffle_points(boxes, config.spacing)
             history = torch.cat([history, fixed[:, None].expand(-1, len(past), -1)])
             kind = torch.cat([kind, kind.new_full((len(fixed),), STATIONARY)])
-        starts.append(Start(history, kind, len(position)))
+        starts.append(Start(history, kind, len(position), before=before))
     return starts
+
+
+def solver_frames(config: ModelConfig, scene: Scene) -> Tensor:
+    """Frames 0 to `solver_steps` of `scene` by the reference solver, shape (K, N, D) [m]."""
+    from gns_model.mpm import MpmSimulator
+
+    solver = MpmSimulator(spacing=config.spacing, frame_interval=config.dt)
+    short = scene.replace(duration=config.solver_steps * config.dt)
+    return torch.from_numpy(solver.rollout([short])[0].positions)
+
+
+def frame_count(config: ModelConfig, scene: Scene) -> int:
+    """Number of frames of a rollout of `scene`, the start included."""
+    return 1 + max(1, math.floor(scene.duration / config.dt + 1e-6))
 
 
 def launched(config: ModelConfig, begin: Start, points: Points, velocity: Tensor) -> Start:
     """`begin` with other velocities of the release [m/s], (D,) or (N, D), differentiable in them.
 
     The points are where they were at t = 0, and the history before it is the new motion.
+
+    Raises:
+        SimulatorError: if the model has `solver_steps`.
     """
+    if config.solver_steps:
+        raise SimulatorError(
+            "this model leaves its first steps to the reference solver, so nothing can be "
+            "differentiated by the velocity of the release"
+        )
     own = torch.tensor(points.velocities).to(begin.history)
     change = velocity.to(begin.history) - own
     past = torch.arange(config.history, -1, -1).to(begin.history) * config.dt

@@ -75,7 +75,7 @@ def _check_fits(model: ModelConfig, source: Source) -> None:
 
 
 #: What of a model's configuration the weights do not depend on: it may change on the way.
-FREE = {"noise_std", "subcells", "bounds"}
+FREE = {"noise_std", "subcells", "bounds", "solver_steps"}
 
 
 def check_resumable(recipe: Recipe, position: Position) -> None:

@@ -15,7 +15,7 @@ from gns_model.training.recipe import RecipeError
 
 #: What may differ between the two configurations: the weights do not depend on it, or, for the
 #: material features, `inherit` makes room.
-FREE = {"noise_std", "subcells", "limits", "bounds", "material_features"}
+FREE = {"noise_std", "subcells", "limits", "bounds", "solver_steps", "material_features"}
 
 _FIRST = "network.encode_vertex.layers.0.weight"
 
