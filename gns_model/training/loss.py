@@ -91,9 +91,9 @@ def unrolled_loss(
             the model's own error, and the last one is the loss.
         linear_beyond, momentum_weight: see `step_error`.
         return_steps: with push-forward, also ask for 1/return_steps of the way back: the true
-            displacement less that part of how far the whole scene has drifted from the truth. A
-            heap that sinks into itself by a hair each step is one-step perfect and a puddle after
-            fifty; so the model learns to push back.
+            displacement less that part of how far a point has drifted from the truth. A heap that
+            sinks into itself by a hair each step is one-step perfect and a puddle after fifty; so
+            the model learns to push back.
     """
 
     def error(after: Tensor, move: Tensor) -> Tensor:

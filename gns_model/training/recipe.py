@@ -68,7 +68,7 @@ class Recipe(BaseModel):
 
     unroll: Count = 1  #: steps K of the unrolled phase
     unroll_fraction: Fraction = 0.0  #: last part of the budget that is unrolled
-    #: Steps in which the unrolled phase asks the model to make up for a scene's drift; `loss`.
+    #: Steps in which the unrolled phase asks the model to make up for its drift; see `loss`.
     return_steps: Annotated[float, Field(ge=1, allow_inf_nan=False)] | None = None
     #: Let gradients flow through all K steps; else only through each step's own (push-forward).
     backprop_through_unroll: bool = False

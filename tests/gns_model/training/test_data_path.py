@@ -292,7 +292,7 @@ def test_an_error_that_a_scene_shares_weighs_more(free_flight):
     assert cost(even, 1000.0) < 1.2
 
 
-def test_a_drift_of_the_scene_is_asked_back(free_flight):
+def test_a_drift_is_asked_back(free_flight):
     """Falling too fast by c: the displacement of the third step is off by 3 c dt², after a drift of
     (1 + 2) c dt². To lose 1/R of that drift, the error to mend is 3 c dt² (1 + 1/R)."""
     net, batch = ballistic(free_flight)
