@@ -6,7 +6,7 @@ from html import escape
 
 import numpy as np
 
-from design import animation, page, wording
+from design import animation, page, viewer, wording
 from design.answer import HEADLINE
 from design.drawing import thumbnail
 from design.flow_figures import shown_flows
@@ -21,11 +21,11 @@ MOST_EMBEDDED = 4_000_000
 
 
 def flow(run: RunResults, pictures: Pictures) -> str:
-    """The animation and the two figures over time."""
+    """The view to be turned, the animation and the two figures over time."""
     shown = shown_flows(run)
     if shown is None:
         return ""
-    parts = []
+    parts = [viewer.view(shown), viewer.script()]
     gif = run.folder / "flow.gif"
     if gif.is_file():
         slower = animation.slow_motion(shown.flows[0][1])
@@ -48,7 +48,7 @@ def flow(run: RunResults, pictures: Pictures) -> str:
     ):
         if name in pictures:
             parts.append(page.picture(*pictures[name], alt, caption))
-    return page.section("How it flows", *parts) if parts else ""
+    return page.section("How it flows", *parts)
 
 
 def trust(run: RunResults, pictures: Pictures) -> str:

@@ -1,4 +1,4 @@
-"""The frame of the report: one HTML page without scripts, network or files beside it."""
+"""The frame of the report: one HTML page without network or files beside it."""
 
 from __future__ import annotations
 
@@ -67,6 +67,17 @@ figure.film{background:#1b1917;border-color:#1b1917}
 figure.film img{max-width:902px;margin:0 auto;border-radius:6px}
 figure.film figcaption{color:#a59e92}
 img.dark{display:none!important}
+figure.flow{--rest:var(--sand);--quick:var(--bad)}
+.flow .panels{display:grid;grid-template-columns:repeat(auto-fit,minmax(300px,1fr));gap:18px}
+.flow canvas{display:block;width:100%;aspect-ratio:16/10;touch-action:none;cursor:grab}
+.flow .numbers{display:grid;grid-template-columns:1fr 1fr;gap:2px 16px;font-size:13.5px;
+ color:var(--muted);margin:8px 0 0;font-variant-numeric:tabular-nums}
+.flow .numbers b{color:var(--ink);font-weight:600}
+.flow .time{display:flex;gap:14px;align-items:center;margin-top:16px}
+.flow input{flex:1;accent-color:var(--best)}
+.flow output{min-width:6em;text-align:right;font-variant-numeric:tabular-nums}
+.flow button{font:inherit;font-size:13.5px;min-width:5.2em;padding:4px 12px;border-radius:8px;
+ border:1px solid var(--line);background:var(--ground);color:var(--ink);cursor:pointer}
 svg .ground{fill:var(--ground);stroke:var(--line)}
 svg .release{fill:var(--sand);fill-opacity:.5}
 svg .best{fill:var(--best)}svg .ranked{fill:var(--sand)}
@@ -99,7 +110,7 @@ footer{margin-top:56px;color:var(--muted);font-size:13px}
 PRINT = """
 @page{size:A4;margin:14mm}
 @media print{body{background:#fff;font-size:11.5px}main{max-width:none;padding:0}
- .card,.tile{border-color:#d8d4cc}section{margin-top:26px}.film{display:none}
+ .card,.tile{border-color:#d8d4cc}section{margin-top:26px}.film,.flow{display:none}
  .card,.tile,figure,tr{break-inside:avoid}h2,h2+p{break-after:avoid}
  .answer{grid-template-columns:1.2fr 1fr}a{color:inherit;text-decoration:none}}
 """
