@@ -41,9 +41,17 @@ def open_data(recipe: Recipe, folders: tuple[str, ...]) -> WindowIndex:
         raise RecipeError(
             f"{folders[0]}: {index.dim}D trajectories, but model.dim = {recipe.model.dim}"
         )
+    if recipe.at_rest:
+        index.sources = [s for s in index.sources if _begins_at_rest(s)]
+        if not index.sources:
+            raise RecipeError(f"{folders[0]}: at_rest = true, but every flow in it is thrown")
     for source in index.sources:
         _check_fits(recipe.model, source)
     return index
+
+
+def _begins_at_rest(source: Source) -> bool:
+    return not any(any(release.velocity) for release in source.scene.releases)
 
 
 def _check_fits(model: ModelConfig, source: Source) -> None:
