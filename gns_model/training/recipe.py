@@ -42,8 +42,8 @@ class Recipe(BaseModel):
 
     train: tuple[str, ...] = Field(min_length=1)  #: folders of trajectory files
     valid: tuple[str, ...] = ()  #: folders of held-out ones; without any, the last model is kept
-    #: Use only flows that are let go, not thrown: impacts hold nearly all the squares of a loss, and
-    #: a column never sees one.
+    #: Use only flows that are let go, not thrown: impacts hold nearly all the squares of a loss,
+    #: and a column never sees one.
     at_rest: bool = False
     valid_rollouts: Count = 8  #: trajectories that a validation simulates, spread over the ranks
     valid_windows: Count = 32  #: windows of the one-step validation loss
