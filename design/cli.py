@@ -6,7 +6,7 @@ Heavy imports wait until a command needs them, so that --help answers at once.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
@@ -23,6 +23,9 @@ from design.options import (
 )
 from design.rebuild import report
 from gns_model import console
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 app = typer.Typer(
     help="Find where baffles stop a granular flow, checked by the reference solver.",
@@ -204,6 +207,15 @@ def _show(summary: dict[str, Any], folder: Path) -> None:
             "(" + ", ".join(f"{v:.3f}" for v in c) + ")" for c in summary["best"]["layout"]
         )
         out.print(f"Layout, centres [m]: {places}", markup=False, highlight=False)
+    if summary.get("front"):
+        out.print(_front_table(summary["front"]))
+    if summary.get("scenarios"):
+        out.print(
+            f"Costs are the {summary['risk']} over {len(summary['scenarios'])} scenarios, measures "
+            "their means.",
+            markup=False,
+            highlight=False,
+        )
     out.print(summary["verdict_text"], markup=False, highlight=False)
     for note in summary["notes"]:
         out.print(f"Note: {note}", markup=False, highlight=False)
@@ -214,6 +226,24 @@ def _show(summary: dict[str, Any], folder: Path) -> None:
         markup=False,
         highlight=False,
     )
+
+
+def _front_table(entries: list[dict[str, Any]]) -> Table:
+    from rich.table import Table
+
+    names = list(entries[0]["objectives"])
+    table = Table(title="Pareto front, relative to no baffles")
+    for column in ("point", *names, *(f"{n}, verified" for n in names), "file"):
+        table.add_column(column, justify="left" if column == "file" else "right")
+    for e in entries:
+        verified = e["verified_objectives"] or {}
+        table.add_row(
+            str(e["point"]),
+            *(f"{e['objectives'][n]:.4f}" for n in names),
+            *(f"{verified[n]:.4f}" if n in verified else "-" for n in names),
+            e["file"],
+        )
+    return table
 
 
 def main() -> None:

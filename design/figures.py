@@ -17,6 +17,7 @@ from PIL import Image
 
 from design.agreement_figures import agreement, deposit
 from design.flow_figures import plan_over_time, side_over_time
+from design.front_figures import front
 from design.results import RunResults
 from design.search_figures import history, trade_off
 from design.theme import DARK, LIGHT, Theme
@@ -30,6 +31,7 @@ FIGURES: dict[str, Callable[[RunResults, Theme], Figure | None]] = {
     "side": side_over_time,
     "deposit": deposit,
     "agreement": agreement,
+    "front": front,
     "tradeoff": trade_off,
     "history": history,
 }

@@ -28,11 +28,6 @@ def front_entries(
     1 is as without baffles. What the solver has not run has None.
     """
 
-    def relative(costs: Sequence[float]) -> dict[str, float] | None:
-        if not costs:
-            return None
-        return {n: c / p.baseline for n, c, p in zip(names, costs, parts, strict=True)}
-
     judged = {j.centres.tobytes(): j for j in verified}
     entries = []
     for k, point in enumerate(points, 1):
@@ -45,15 +40,26 @@ def front_entries(
                 "layout": np.round(point.centres, 6).tolist(),
                 "file": f"layouts/{_name(k)}",
                 "cost": point.cost,
-                "objectives": relative(point.outcome.costs),
+                "objectives": relative(point.outcome.costs, parts, names),
                 "surrogate": point.outcome.measures,
-                "verified_objectives": relative(seen.verified_costs) if seen else None,
+                "verified_objectives": relative(seen.verified_costs, parts, names)
+                if seen
+                else None,
                 "verified_cost": seen.verified_cost if seen else None,
                 "verified": seen.verified if seen else None,
                 "verified_status": seen.verified_status if seen else None,
             }
         )
     return entries
+
+
+def relative(
+    costs: Sequence[float], parts: Sequence[Objective], names: Sequence[str]
+) -> dict[str, float] | None:
+    """Costs by name, without their weights: 1 is as without baffles; None if there are none."""
+    if not costs:
+        return None
+    return {n: c / p.baseline for n, c, p in zip(names, costs, parts, strict=True)}
 
 
 def write_front(folder: Path, bare: Scene, entries: Sequence[dict[str, Any]]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -45,6 +46,16 @@ def spread(points: Sequence[Trial], count: int) -> list[Trial]:
         away = np.linalg.norm(scaled[:, None] - scaled[None, chosen], axis=-1).min(axis=1)
         chosen.append(int(np.argmax(away)))
     return [points[k] for k in chosen]
+
+
+def staircase(points: np.ndarray) -> np.ndarray:
+    """The border of what a front of two objectives dominates, corner by corner, shape (k, 2)."""
+    points = np.asarray(points, dtype=float)
+    points = points[np.lexsort(points.T[::-1])]
+    corners = [points[0]]
+    for before, after in pairwise(points):
+        corners += [np.array([after[0], before[1]]), after]
+    return np.array(corners)
 
 
 def hypervolume(costs: np.ndarray, corner: Sequence[float]) -> float:

@@ -14,6 +14,7 @@ from design import animation, page
 from design.answer import answer, gains
 from design.evidence import Pictures, choice, flow, search, trust
 from design.figures import write_figures
+from design.front_page import pareto, scenarios
 from design.provenance import files, reproduce
 from design.results import RunResults
 from gns_model.scene import write_whole
@@ -46,6 +47,8 @@ def render(run: RunResults, pictures: Pictures) -> str:
         gains(run),
         flow(run, pictures),
         trust(run, pictures),
+        pareto(run, pictures),
+        scenarios(run),
         choice(run, pictures),
         search(run, pictures),
         reproduce(run),

@@ -34,7 +34,7 @@ import numpy as np
 from design.campaign import Campaign, Evaluator
 from design.evaluators import InProcess, InWorkers, SimulatorSpec, TaskSpec, failure_cost
 from design.evaluators import differentiable as has_gradient
-from design.front import front_entries, write_front
+from design.front import front_entries, relative, write_front
 from design.methods import METHODS, choose
 from design.pareto import front, spread
 from design.risk import Flow, weigh
@@ -128,9 +128,15 @@ class Run:
         flows = [scene.with_baffles([])]
         if settings.scenarios:
             self.drawn, self.notes = settings.scenarios.draw(scene, settings.simulator.load())
-            flows = scenes(scene, self.drawn)
-        # What is clear of the largest release is clear of all.
-        largest = widest(flows).replace(baffles=scene.baffles, placement=scene.placement)
+            flows = scenes(flows[0], self.drawn)
+        # What is clear of the largest release is clear of all. A scene without a placement keeps
+        # its baffles here, for they say how large one is.
+        largest = widest(flows)
+        if scene.placement is None:
+            largest = largest.replace(baffles=scene.baffles)
+        else:
+            sized = scene.placement.model_copy(update={"size": scene.baffle_size})
+            largest = largest.replace(placement=sized)
         self.space = LayoutSpace(largest, self.baffles)
         #: The scene without baffles, and each flow on it that a layout has to stand.
         self.bare = scene.replace(baffles=(), placement=self.space.placement)
@@ -274,6 +280,9 @@ class Run:
         if s.objectives:
             found["objectives"] = [str(part) for part in s.parts]
             found["front"] = front_entries(front(trials), s.parts, s.objectives, self.ranked)
+            found["tried"] = [
+                relative(t.outcome.costs, s.parts, s.objectives) for t in trials if t.ok
+            ]
         if s.scenarios:
             found["risk"] = str(s.risk)
             found["scenarios"] = [asdict(flow) for flow in self.drawn]

@@ -343,7 +343,7 @@ def _trial(frozen: FrozenTrial) -> Trial | None:
 
 def _same_task(known: dict[str, Any], asked: dict[str, Any]) -> None:
     for key in [*asked, *(key for key in known if key not in asked)]:
-        if known.get(key) != asked[key]:
+        if known.get(key) != asked.get(key):
             values = known.get(key), asked.get(key)
             plain = not any(isinstance(v, (dict, list)) for v in values)
             detail = f" ({values[0]!r}, now {values[1]!r})" if plain else ""
