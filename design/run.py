@@ -31,6 +31,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from design.blame import room_for
 from design.campaign import Campaign, Evaluator
 from design.evaluators import InProcess, InWorkers, SimulatorSpec, TaskSpec, failure_cost
 from design.evaluators import differentiable as has_gradient
@@ -54,7 +55,6 @@ from design.summary import (
 from design.trials import Outcome, StudyError, Trial, TrialLog, sqlite_url, storage_errors
 from design.verify import Judged, as_judged, candidates, rank
 from design.workers import Workers, default_count
-from gns_env.layout import LayoutSpace
 from gns_env.scenario import Scenario
 from gns_model.console import progress_bar
 from gns_model.errors import SceneError, SimulatorError
@@ -137,7 +137,7 @@ class Run:
         else:
             sized = scene.placement.model_copy(update={"size": scene.baffle_size})
             largest = largest.replace(placement=sized)
-        self.space = LayoutSpace(largest, self.baffles)
+        self.space = room_for(largest, self.baffles)
         #: The scene without baffles, and each flow on it that a layout has to stand.
         self.bare = scene.replace(baffles=(), placement=self.space.placement)
         self.flows = [flow.replace(placement=self.space.placement) for flow in flows]
