@@ -17,8 +17,10 @@ export OMP_NUM_THREADS ?= 1
 demo: .venv/.done
 	.venv/bin/gns-design optimize examples/flume.toml --budget 24 --verify 3 --out $(RUN)
 
+# A process a core; each takes from the others' tests when its own are done.
+JOBS ?= auto
 test: .venv/.done
-	$(PY) -m pytest --durations=15
+	$(PY) -m pytest --numprocesses $(JOBS) --dist worksteal --durations=15
 
 lint: .venv/.done
 	.venv/bin/ruff check .

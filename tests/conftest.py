@@ -22,6 +22,35 @@ settings.register_profile(
 )
 settings.load_profile("project")
 
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Compile the kernels once, before several processes would each begin with that."""
+    if getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput"):
+        compile_kernels()
+
+
+def compile_kernels() -> None:
+    """Fill numba's cache, which every later process reads, by running a flow of a few points."""
+    import torch
+
+    from gns_model.learned.graph import radius_graph
+    from gns_model.mpm import MpmSimulator
+
+    for dim in (2, 3):
+        for dtype in (torch.float32, torch.float64):
+            radius_graph(torch.zeros((2, dim), dtype=dtype), 1.0)
+        scene = Scene.from_dict(
+            {
+                "duration": 1e-3,
+                "domain": {"lower": [0.0] * dim, "upper": [1.0] * dim},
+                "release": [{"lower": [0.0] * dim, "upper": [0.1] * dim, "velocity": [0.0] * dim}],
+                "baffle": [{"center": [0.5] * (dim - 1), "size": [0.1] * dim}],
+            }
+        )
+        for threads in (1, 2):
+            MpmSimulator(spacing=0.05, threads=threads).rollout([scene])
+
+
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 

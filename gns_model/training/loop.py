@@ -110,6 +110,7 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: Stop) ->
         assert validator is not None
         judged.load_state_dict(model.state_dict())
         average.copy_to(judged)
+        release_heap()  # rollouts need little of what the steps held
         with stop.may_abandon():
             scores = validator(judged, lambda: stop.requested, display.validating)
         # Rank 0's time for all, or they would disagree about when the next one is due.
