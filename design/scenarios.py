@@ -20,7 +20,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from design.risk import MEAN, Risk
-from gns_env.scenario import Scenario, ScenarioSpace
+from gns_env.scenario import VOLUME_RATIO, Scenario, ScenarioSpace
 from gns_model.errors import GnsError
 from gns_model.scene import Scene
 
@@ -66,6 +66,11 @@ class Scenarios:
             given = getattr(self, name)
             if given is not None and not (np.isfinite(given).all() and 0 <= given[0] <= given[1]):
                 raise ScenarioError(f"{name} must be a range low:high, got {given[0]}:{given[1]}")
+        if self.volume and not 1 / VOLUME_RATIO <= self.volume[0] <= self.volume[1] <= VOLUME_RATIO:
+            raise ScenarioError(
+                f"volume is relative to the scene's and must lie in {1 / VOLUME_RATIO:g} to "
+                f"{VOLUME_RATIO:g}, got {self.volume[0]:g}:{self.volume[1]:g}"
+            )
 
     def draw(self, scene: Scene, simulator: Any = None) -> tuple[list[Scenario], list[str]]:
         """The flows, and a line for every range that the simulator's training cut.
