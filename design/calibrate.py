@@ -160,6 +160,8 @@ def _tell(found: Found, wanted: Unknown, target: str, simulator: str, as_json: b
     if found.at_bound:
         print("That is the end of the range that was looked through: the true value may lie beyond")
     cost = f"{found.rollouts} rollouts"
+    if found.method == "differences" and found.backwards:
+        cost += f" and {found.backwards} backward passes, whose slopes did not lead down"
     if found.method == "gradient":
         cost += (
             f" and {found.backwards} backward passes; finite differences take "

@@ -20,14 +20,12 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gns_model.errors import FileFormatError, GnsError
-from gns_model.learned.rollout import ADJOINT_LIMIT
 from gns_model.measures import FRONT_QUANTILE, moving_positions
 from gns_model.scene import Scene
 from gns_model.smooth_measures import TEMPERATURE, smooth_quantile
@@ -54,8 +52,6 @@ class Deposit:
     quantiles: np.ndarray
     points: int
     source: str
-    #: All grains count alike, so those with much larger adjoints are chaos: see `LimitAdjoint`.
-    adjoint_limit: ClassVar[float | None] = ADJOINT_LIMIT
 
     def residuals(self, positions: Tensor) -> Tensor:
         """Of the last frame of `positions` (T, N, D) [m], shape (LEVELS * D,): d² is their sum
@@ -73,8 +69,6 @@ class Runout:
     """How far the front of 99% of the material travels [m]."""
 
     metres: float
-    #: Few grains make the front, and have all of the adjoint by right.
-    adjoint_limit: ClassVar[float | None] = None
 
     def residuals(self, positions: Tensor) -> Tensor:
         """Runout - target of `positions` (T, N, D) [m], shape (1,)."""

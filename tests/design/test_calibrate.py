@@ -10,6 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from design import inverse
 from design.cli import app
 from design.inverse import calibrate, default_method
 from design.target import LEVELS, Deposit, Runout, TargetError, quantiles, read_deposit, read_runout
@@ -91,6 +92,24 @@ def test_velocity_is_recovered(learned, scene, tmp_path, method):
     else:
         assert found.rollouts == found.rollouts_by_differences
         assert found.backwards == 0
+
+
+def test_a_gradient_that_leads_nowhere_gives_way_to_differences(
+    learned, scene, tmp_path, monkeypatch
+):
+    right = inverse._Measure._by_gradient
+
+    def wrong(self, value):
+        squared, slope = right(self, value)
+        return squared, -slope
+
+    monkeypatch.setattr(inverse._Measure, "_by_gradient", wrong)
+    truth = ReleaseVelocity([0]).put(scene, np.array([1.2]))
+    target, _ = read_deposit(deposit_of(learned, truth, tmp_path), scene)
+    found = calibrate(scene, learned, target, "velocity", budget=20)
+    assert found.method == "differences"
+    assert found.backwards > 0
+    assert found.value[0] == pytest.approx(1.2, abs=0.02)
 
 
 def test_friction_is_recovered_by_gradient(learned, scene, tmp_path):
