@@ -12,13 +12,17 @@ from gns_model.data.windows import Window, WindowIndex
 from gns_model.learned.config import PAPER_TYPES, ModelConfig
 from gns_model.learned.graph import radius_graph
 from gns_model.learned.model import LearnedModel
+from gns_model.learned.world import baffle_boxes, baffle_points
 from gns_model.particles import MOVING, STATIONARY
 from gns_model.training import Recipe, RecipeError, train
 from gns_model.training.batches import Draw, collate, read
+from gns_model.training.distributed import Ranks
 from gns_model.training.kinematic import kinematic_spacing, with_baffle_points
 from gns_model.training.loss import unrolled_loss
 from gns_model.training.setup import open_data
 from gns_model.training.statistics import measure
+from gns_model.training.validation import Validator
+from gns_model.trajectory import Trajectory
 
 SPACING, DT, RADIUS = 0.0625, 0.02, 0.1
 CPU = torch.device("cpu")
@@ -140,3 +144,58 @@ def test_types_of_a_window_reach_the_embedding(slides):
     assert torch.equal(predict(MOVING), predict(MOVING))
     assert not torch.allclose(predict(MOVING), predict(5))
     assert isinstance(window, Window)
+
+
+@pytest.fixture(scope="module")
+def foreign(slides, tmp_path_factory):
+    """`slides` as an import leaves it: moving points of type 5, and a baffle of type 3 as rows."""
+    folder = tmp_path_factory.mktemp("foreign")
+    for path in sorted(slides.iterdir())[:2]:
+        ours = Trajectory.load(path)
+        chosen = (ours.lattice % 2 == 0).all(axis=1)  # foreign points have the model's spacing
+        fixed = baffle_points(baffle_boxes(ours.scene), SPACING).numpy()
+        still = np.repeat(fixed[None], len(ours.time), axis=0)
+        moving = ours.positions[:, chosen]
+        Trajectory(
+            positions=np.concatenate([moving, still], axis=1),
+            time=ours.time,
+            particle_type=np.repeat([5, STATIONARY], [moving.shape[1], len(fixed)]).astype(np.int8),
+            scene=ours.scene.with_baffles([]),
+            point_volume=ours.point_volume * 8,
+            foreign=True,
+        ).save(folder / path.name)
+    return folder
+
+
+def test_foreign_trajectories_train_and_are_validated_by_going_on(foreign, tiny, tmp_path):
+    small = {"spacing": SPACING, "dt": DT, "radius": RADIUS, "latent": 8, "blocks": 2}
+    model = {**ModelConfig.paper(3).model_dump(mode="json", exclude={"limits"}), **small}
+    values = {**tiny, "train": [str(foreign)], "valid": [str(foreign)], "model": model}
+    recipe = Recipe.from_dict({**values, "steps": 3, "mirror": False})
+    assert train(recipe, tmp_path) == tmp_path / "model"
+    # A model that keeps the velocity it sees is near a flow that hardly slows down from there on.
+    windows = index(foreign)
+    net = paper_model()
+    with torch.no_grad():
+        for p in net.network.decode.parameters():
+            p.zero_()
+    scores = Validator(windows, Ranks(0, 1, CPU), 2, 2)(net, lambda: False)
+    assert scores.complete
+    assert scores.diverged == 0
+    assert {"runout_max", "centroid_travel", "energy"} == set(scores.errors)
+    assert 0.01 < scores.errors["centroid_travel"] < 1
+    # By hand: from the first frame with a whole history on, at constant velocity.
+    truth = Trajectory.load(sorted(foreign.iterdir())[0])
+    first = windows.first(0)
+    x = truth.positions[:, truth.particle_type == 5, 0].mean(axis=1)
+    steps = (len(x) - 1 - first) // 2
+    going_on = steps * (x[first] - x[first - 2])
+    error = abs(going_on - (x[-1] - x[first])) / max(x[-1] - x[first], 0.05)
+    alone = Validator(windows, Ranks(0, 1, CPU), 1, 1)(net, lambda: False)
+    assert alone.errors["centroid_travel"] == pytest.approx(min(1.0, error), rel=1e-3)
+
+
+def test_a_model_of_boxes_refuses_kinematic_points(foreign, tiny):
+    recipe = Recipe.from_dict({**tiny, "train": [str(foreign)]})
+    with pytest.raises(RecipeError, match='use "points"'):
+        open_data(recipe, recipe.train)
