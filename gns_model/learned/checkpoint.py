@@ -2,7 +2,8 @@
 
 The card (JSON, format `gns-model`, version 1) holds `name`, `config` (ModelConfig), `parameters`,
 `normalisation` (for reading; the model's own copy is in the weights), `weights_sha256`, and what
-the trainer adds: `trained_on`, `scores`, notes. Each file is written whole; the checksum tells a
+the trainer adds: `trained_on`, `scores`, notes, and `verdict`, a line that whoever loads the model
+shall read (a model that misses its aims). Each file is written whole; the checksum tells a
 card from the weights of another save. The weights carry a copy of their card and a checksum of
 their tensors, which count where a process was killed between the two files. Nothing is unpickled.
 """
@@ -14,6 +15,7 @@ import json
 import os
 import shutil
 import tempfile
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -149,6 +151,8 @@ def load_model(
         reason = str(error).splitlines()[0]
         raise SimulatorError(f"device {device!r} cannot be used: {reason}") from None
     name = str(card.get("name", path.name))
+    if card.get("verdict"):
+        warnings.warn(f"{name}: {card['verdict']}", stacklevel=2)
     return LearnedSimulator(model, name=name, card=card, **options)
 
 

@@ -24,7 +24,6 @@ from gns_model.evaluation import (
 )
 from gns_model.evaluation_figures import deposit_figure, scatter_figure
 from gns_model.learned import LearnedModel, LearnedSimulator, ModelConfig
-from gns_model.learned.checkpoint import shipped_models
 from gns_model.mpm import MpmSimulator
 from gns_model.particles import MOVING, fill
 from gns_model.scene import Scene
@@ -370,7 +369,7 @@ def test_the_gradient_of_an_untrained_net_is_checked_too(small_flume: Scene):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(shipped_models()))
+@pytest.mark.parametrize("name", ["baffle-lite"])  # the one that layouts are chosen with
 def test_a_shipped_model_knows_which_way_to_move_a_baffle(name: str, flume: Scene):
     """Over the whole flow; the paper's way of baffles had a cosine of -0.6 here, and our own exact
     gradient 0.26. Measured: 0.79. The aim of 0.9 is not met yet: README says by how much."""

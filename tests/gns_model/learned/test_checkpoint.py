@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import warnings
 
 import numpy as np
 import pytest
@@ -121,3 +122,14 @@ def test_unusable_device(saved):
 def test_shipped_models_can_be_loaded_by_name():
     for name in shipped_models():
         assert load_simulator(name).name == name
+
+
+def test_a_model_that_misses_its_aims_says_so_when_it_is_loaded(make_model, tmp_path):
+    model = make_model()
+    save_model(tmp_path / "poor", model, {"verdict": "misses its aims"})
+    with pytest.warns(UserWarning, match="poor: misses its aims"):
+        load_model(tmp_path / "poor")
+    save_model(tmp_path / "good", model)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_model(tmp_path / "good")
