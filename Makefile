@@ -28,7 +28,9 @@ lint: .venv/.done
 
 benchmarks: .venv/.done
 	$(PY) benchmarks/mpm.py
+	$(PY) benchmarks/mpm_torch.py
 	$(PY) benchmarks/upstream_depth.py
+	$(PY) benchmarks/vector_env.py
 
 clean:
 	rm -rf .venv runs build *.egg-info
