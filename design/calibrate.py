@@ -37,7 +37,7 @@ def calibrate(
     runout: Annotated[
         Optional[float],  # noqa: UP045
         typer.Option(
-            help="Or the runout to match: travel of the front of 99% of the material [m].",
+            help="Or the runout to match: travel of the front of 99% of the material in m.",
             show_default=False,
         ),
     ] = None,

@@ -75,7 +75,7 @@ def optimize(
     speed: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option(
-            help="Range of the release's speed [m/s]; default: 0.8 to 1.2 times the scene's.",
+            help="Range of the release's speed in m/s; default: 0.8 to 1.2 times the scene's.",
             show_default=False,
         ),
     ] = None,
@@ -89,7 +89,7 @@ def optimize(
     friction: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option(
-            help="Range of the friction angle [degrees]; default: 5 less to 5 more than the "
+            help="Range of the friction angle in degrees; default: 5 less to 5 more than the "
             "scene's. The default ranges keep to what a learned simulator was trained for.",
             show_default=False,
         ),

@@ -19,7 +19,7 @@ def evaluate(
     layout: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option(
-            help="TOML file whose [[baffle]] entries stand in place of the scene's, such as "
+            help="TOML file whose baffle tables stand in place of the scene's, such as "
             "layouts/best.toml of a run; nothing else in it is read.",
             show_default=False,
         ),

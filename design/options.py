@@ -17,7 +17,7 @@ Simulator = Annotated[
 ]
 Spacing = Annotated[
     Optional[float],  # noqa: UP045  (typer reads it at run time, also on Python 3.11)
-    typer.Option(help="Spacing of points for mpm [m]; default: the solver's fine one."),
+    typer.Option(help="Spacing of points for mpm in m; default: the solver's fine one."),
 ]
 Weight = Annotated[
     Optional[float],  # noqa: UP045

@@ -61,7 +61,7 @@ def simulate(
     ] = None,
     threads: Annotated[int, typer.Option(min=1, help="Threads of the solver.")] = CORES,
     spacing: Annotated[
-        float | None, typer.Option(help="Of the solver's points [m]; default: the paper's.")
+        float | None, typer.Option(help="Of the solver's points in m; default: the paper's.")
     ] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -97,7 +97,7 @@ def validate(
     as_json: Json = False,
     workers: Workers = CORES,
     spacing: Annotated[
-        float | None, typer.Option(help="Of the flume's points [m]; default: the paper's.")
+        float | None, typer.Option(help="Of the flume's points in m; default: the paper's.")
     ] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -150,10 +150,10 @@ def generate(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the scenes.")] = 0,
     workers: Workers = CORES,
     spacing: Annotated[
-        float | None, typer.Option(help="Of the solver's points [m]; default: the paper's.")
+        float | None, typer.Option(help="Of the solver's points in m; default: the paper's.")
     ] = None,
     frame_interval: Annotated[
-        float, typer.Option(min=1e-6, help="Between stored frames [s].")
+        float, typer.Option(min=1e-6, help="Between stored frames in s.")
     ] = 0.01,
     solver: Annotated[
         Solver | None,

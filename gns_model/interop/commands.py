@@ -18,7 +18,7 @@ Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bar.")]
 Metadata = Annotated[Path, typer.Option(help="metadata.json of the dataset.")]
 Dt = Annotated[
     float | None,
-    typer.Option(min=1e-9, help="Time between frames [s]; default: the metadata's, or 0.0025."),
+    typer.Option(min=1e-9, help="Time between frames in s; default: the metadata's, or 0.0025."),
 ]
 
 
@@ -51,13 +51,13 @@ def import_model(
         typer.Option(help="doubled for weights trained before December 2024, else residual."),
     ],
     noise_std: Annotated[
-        float, typer.Option(min=0.0, help="Its training noise [m]; theirs is 6.7e-4 by default.")
+        float, typer.Option(min=0.0, help="Its training noise in m; theirs is 6.7e-4 by default.")
     ],
     out: Annotated[Path, typer.Option(help="Checkpoint folder to write.")],
     dt: Dt = None,
     spacing: Annotated[
         float | None,
-        typer.Option(min=1e-9, help="Of the points of a scene [m]; default: by the radius."),
+        typer.Option(min=1e-9, help="Of the points of a scene in m; default: by the radius."),
     ] = None,
 ) -> None:
     """Import the weights of geoelements/gns as a model of ours."""
@@ -91,7 +91,7 @@ def import_dataset(
     dt: Dt = None,
     spacing: Annotated[
         float | None,
-        typer.Option(min=1e-9, help="Of the points [m]; default: as the first frame shows."),
+        typer.Option(min=1e-9, help="Of the points in m; default: as the first frame shows."),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -117,7 +117,7 @@ def export_dataset(
     out: Annotated[Path, typer.Option(help="File to write, such as train.npz.")],
     radius: Annotated[
         float | None,
-        typer.Option(min=1e-9, help="Connectivity radius for the metadata [m]; default: paper's."),
+        typer.Option(min=1e-9, help="Connectivity radius for the metadata in m; default: paper's."),
     ] = None,
     quiet: Quiet = False,
 ) -> None:

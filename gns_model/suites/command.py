@@ -61,7 +61,7 @@ def evaluate(
     ] = 0,
     spacing: Annotated[
         float | None,
-        typer.Option(help="Of the solver's points in a suite [m]; default: the paper's element."),
+        typer.Option(help="Of the solver's points in a suite in m; default: the paper's element."),
     ] = None,
     budget: Annotated[
         float,
