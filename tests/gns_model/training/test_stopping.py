@@ -115,7 +115,7 @@ def test_kill_9_at_random_moments_leaves_checkpoints_that_load(tiny, tmp_path, w
         **{k: v for k, v in tiny.items() if k != "steps"},
         "minutes": 60,
         "checkpoint_minutes": 1e-9,
-        "validate_minutes": 0.002,
+        "validate_minutes": 0.01,
         "unroll": 1,
     }
     recipe = write_recipe(tmp_path / "r.toml", values)
