@@ -26,7 +26,8 @@ def run(tmp_path_factory):
 
 def test_a_whole_run_has_every_figure(run):
     pictures = write_figures(run)
-    assert set(pictures) == set(FIGURES)
+    # The front is drawn where there are several objectives: test_pareto.py.
+    assert set(pictures) == set(FIGURES) - {"front"}
     for name, (light, dark) in pictures.items():
         shown = Image.open(run.folder / "figures" / f"{name}.png").convert("RGB")
         assert shown.width > 1500
