@@ -116,14 +116,8 @@ def unrolled_loss(
                 history = torch.cat([history[:, 1:], after[:, None]], dim=1)
         move = batch.moves[:, steps - 1]
         if return_steps is not None and steps > 1:
-            scene, truth = (
-                batch.world.batch,
-                batch.history[:, -1] + batch.moves[:, : steps - 1].sum(1),
-            )
-            drift, of = history[:, -1] - truth, scene
-            if batch.moving is not None:
-                drift, of = drift[batch.moving], scene[batch.moving]
-            move = move - _scene_mean(drift, of)[scene] / return_steps
+            truth = batch.history[:, -1] + batch.moves[:, : steps - 1].sum(1)
+            move = move - (history[:, -1] - truth) / return_steps
         return error(model.step(history, batch.world), move)
     total = batch.moves.new_zeros(())
     for k in range(steps):

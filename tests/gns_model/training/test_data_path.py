@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -307,6 +309,22 @@ def test_a_drift_is_asked_back(free_flight):
         assert float(unrolled_loss(net, batch, steps=1, return_steps=2.0)) == pytest.approx(
             float(unrolled_loss(net, batch, steps=1))
         )
+
+
+def test_every_point_is_asked_back_by_itself(free_flight):
+    """Half of the points drift up by d and half of them down: the scene as a whole drifts nowhere,
+    and each point is still asked to make up for d / R in its next step."""
+    net, batch = ballistic(free_flight)
+    drift, steps_back = 1e-3, 4.0
+    signs = torch.where(torch.arange(len(batch.moves)) % 2 == 0, 1.0, -1.0)
+    moves = batch.moves.clone()
+    moves[:, 0, 1] -= signs * drift
+    apart = replace(batch, moves=moves)
+    with torch.no_grad():
+        assert float(unrolled_loss(net, apart, steps=2)) < 1e-3
+        found = float(unrolled_loss(net, apart, steps=2, return_steps=steps_back))
+        scale = net.config.dt**2 * float(net.acceleration_std[1])
+    assert found == pytest.approx((drift / steps_back / scale) ** 2 / 3, rel=0.02)
 
 
 def test_early_windows_are_drawn_as_often_as_asked(slides):
