@@ -27,7 +27,8 @@ def test_every_layout_is_one_point_whatever_its_numbering(n, seed):
 @given(st.sampled_from(sorted(SPACES)), st.data())
 def test_every_point_is_one_layout(n, data):
     space = SPACES[n]
-    parameters = {name: data.draw(st.floats(0.05, 1.0)) for name in names(space)}
+    # Below 1: at 1 two baffles stand at one place across, and x decides which is the first.
+    parameters = {name: data.draw(st.floats(0.05, 0.999)) for name in names(space)}
     centres = to_centres(space, parameters)
     assert (np.diff(centres[:, -1]) >= 0).all()
     back = to_parameters(space, centres)
