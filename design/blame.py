@@ -33,9 +33,8 @@ def _culprit(scene: Scene, n_baffles: int) -> str | None:
     if placement is None or n_baffles < 1:
         return None
     # Sizes may come from baffles that stand in the way of what is tried here.
-    bare = scene.replace(
-        baffles=(), placement=placement.model_copy(update={"size": scene.baffle_size})
-    )
+    own = {"size": scene.baffle_size, "yaw": scene.baffle_yaw or None}
+    bare = scene.replace(baffles=(), placement=placement.model_copy(update=own))
     assert bare.placement is not None
     to_blame = [
         name

@@ -135,8 +135,8 @@ class Run:
         if scene.placement is None:
             largest = largest.replace(baffles=scene.baffles)
         else:
-            sized = scene.placement.model_copy(update={"size": scene.baffle_size})
-            largest = largest.replace(placement=sized)
+            own = {"size": scene.baffle_size, "yaw": scene.baffle_yaw or None}
+            largest = largest.replace(placement=scene.placement.model_copy(update=own))
         self.space = room_for(largest, self.baffles)
         #: The scene without baffles, and each flow on it that a layout has to stand.
         self.bare = scene.replace(baffles=(), placement=self.space.placement)
@@ -351,8 +351,11 @@ class Run:
 
     def _log_own_layout(self, centres: np.ndarray, outcome: Outcome) -> None:
         """The scene's own layout is a trial too, where the search could have proposed it."""
-        same_size = all(np.allclose(b.size, self.space.size) for b in self.scene.baffles)
-        if len(centres) != self.baffles or not same_size or self.space.check(centres):
+        alike = all(
+            np.allclose(b.size, self.space.size) and np.isclose(b.yaw, self.space.yaw)
+            for b in self.scene.baffles
+        )
+        if len(centres) != self.baffles or not alike or self.space.check(centres):
             return
         if not any(trial.origin == "scene" for trial in self.log.trials()):
             self.log.add("scene", centres, outcome)

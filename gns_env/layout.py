@@ -1,6 +1,8 @@
 """What may be placed where: the buildable layouts of a scene, and the nearest one to a wish.
 
-Baffles of one size stand axis-aligned on the base. A layout is buildable when
+Baffles of one size and yaw stand on the base. The footprint of turned ones is taken to be the
+rectangle along the axes that holds it: what is called buildable is so, and of the rest some could
+be built, too. A layout is buildable when
 
 - every whole footprint lies inside the placement rectangle, and so inside the domain;
 - any two footprints are at least `gap` clear of each other **along x or along z** (the distance of
@@ -20,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from gns_env.projection import Projector
 from gns_env.room import free_rectangles, nearest_free, pack
 from gns_model.errors import LayoutError
+from gns_model.footprint import bounding_size
 from gns_model.scene import TOLERANCE, Box, Placement, Scene
 
 Array = NDArray[np.float64]
@@ -35,8 +38,9 @@ class LayoutSpace:
 
     Attributes:
         scene, n_baffles: as given.
-        placement: the scene's, or the default one, with the size of a baffle filled in.
+        placement: the scene's, or the default one, with size and yaw of a baffle filled in.
         size: of one baffle [m], shape (D,): along x, height, along z.
+        yaw: of every baffle [degrees].
         lower, upper: bounds of a centre [m], shape (D-1,): the placement less half a baffle.
         gap: least clear distance [m].
         dim: length of an encoded layout, n_baffles * (D-1).
@@ -52,9 +56,13 @@ class LayoutSpace:
         self.scene, self.n_baffles = scene, int(n_baffles)
         self.size = np.array(scene.baffle_size, dtype=float)
         placement = scene.placement or _default_placement(scene)
-        self.placement = placement.model_copy(update={"size": scene.baffle_size})
+        self.yaw = scene.baffle_yaw
+        own = {"size": scene.baffle_size, "yaw": self.yaw or None}
+        self.placement = placement.model_copy(update=own)
         self.gap = placement.gap
         self._footprint = self.size[[0, *range(2, scene.dim)]]
+        if self.yaw:
+            self._footprint = bounding_size(self._footprint, self.yaw)
         self._area = np.array([placement.lower, placement.upper], dtype=float)
         self.lower, self.upper = (
             self._area[0] + self._footprint / 2,

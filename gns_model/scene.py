@@ -14,6 +14,7 @@ value, and is read from and written to TOML.
     [[baffle]]                      # none or more rigid boxes that stand on the base
     center = [0.775, 0.375]         # (x, z); in 2D [x]
     size = [0.15, 0.30, 0.15]       # (along x, height, along z); in 2D (along x, height)
+    yaw = 20.0                      # optional, 3D only: turned by so many degrees from x towards z
     [placement]                     # optional: where a search may put baffles
     lower = [0.6, 0.1]
     upper = [1.5, 1.9]
@@ -31,8 +32,16 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
 
+from gns_model import footprint
 from gns_model.errors import SceneError
 
 Vector = tuple[float, ...]
@@ -120,11 +129,22 @@ class Release(Box):
     velocity: Vector
 
 
+#: Turn of a baffle about the vertical [degrees]; half a turn changes nothing.
+Yaw = Annotated[float, Field(gt=-90, le=90, allow_inf_nan=False)]
+
+
 class Baffle(_Part):
-    """A rigid box that stands on the base: plan `center` [m] and `size` [m], height second."""
+    """A rigid box that stands on the base: plan `center` [m] and `size` [m], height second.
+
+    In 3D it may be turned about the vertical through its centre, by `yaw` degrees from x towards
+    z: counter-clockwise in a plan with x to the right and z up. With t = yaw, the corners of its
+    footprint are center + (u cos t - v sin t, u sin t + v cos t), where u = ±size[0]/2 and
+    v = ±size[2]/2.
+    """
 
     center: Vector
     size: Annotated[Vector, Field(min_length=2)]
+    yaw: Yaw = 0.0
 
     @model_validator(mode="after")
     def _shape(self) -> Baffle:
@@ -135,11 +155,40 @@ class Baffle(_Part):
             )
         if min(self.size) <= 0:
             raise ValueError(f"size must be positive, got {self.size}")
+        if self.yaw != 0 and len(self.size) != 3:
+            raise ValueError(f"only a baffle in 3D can be turned, got yaw = {self.yaw:g} in 2D")
         return self
 
+    @model_serializer(mode="wrap")
+    def _without_no_yaw(self, plain: Any) -> dict[str, Any]:
+        # Files and keys of scenes that turn nothing are what they were before there was a yaw.
+        values = plain(self)
+        if not self.yaw:
+            values.pop("yaw")
+        return values
+
+    @property
+    def corners(self) -> np.ndarray:
+        """Corners of the footprint in order around it [m], shape (4, 2), (x, z); 3D only."""
+        return footprint.corners(self.center, (self.size[0], self.size[2]), self.yaw)
+
+    @property
+    def unturned(self) -> tuple[Vector, float]:
+        """Size and yaw, where a quarter turn is written as exchanged sizes and no yaw."""
+        if self.yaw == 90:
+            return (self.size[2], self.size[1], self.size[0]), 0.0
+        return self.size, self.yaw
+
     def box(self, base: float) -> Box:
-        """The box that it fills when it stands on a base at height `base` [m]."""
-        half = (self.size[0] / 2, *(s / 2 for s in self.size[2:]))
+        """The box along the axes that holds it when it stands on a base at height `base` [m].
+
+        Unturned, or by a quarter turn, the baffle fills it.
+        """
+        size = self.unturned[0]
+        half = (size[0] / 2, *(s / 2 for s in size[2:]))
+        if self.unturned[1]:
+            plan = footprint.bounding_size((size[0], size[2]), self.yaw)
+            half = (float(plan[0]) / 2, float(plan[1]) / 2)
         low = [c - h for c, h in zip(self.center, half, strict=True)]
         high = [c + h for c, h in zip(self.center, half, strict=True)]
         return Box(lower=(low[0], base, *low[1:]), upper=(high[0], base + self.size[1], *high[1:]))
@@ -156,6 +205,7 @@ class Placement(_Part):
     upper: Vector
     gap: NonNegative = 0.05
     size: Vector | None = None  #: size of a baffle to place [m]; default: the scene's first
+    yaw: Yaw | None = None  #: yaw of a baffle to place [degrees]; default: the scene's first, or 0
     keep_out: tuple[Vector, ...] = ()
 
     @model_validator(mode="after")
@@ -167,6 +217,8 @@ class Placement(_Part):
             raise ValueError(f"every upper must exceed its lower, got {self.lower} to {self.upper}")
         if self.size is not None and (len(self.size) != n + 1 or min(self.size) <= 0):
             raise ValueError(f"size needs {n + 1} positive numbers, got {self.size}")
+        if self.yaw and n != 2:
+            raise ValueError(f"only a baffle in 3D can be turned, got yaw = {self.yaw:g} in 2D")
         for k, r in enumerate(self.keep_out):
             if len(r) != 2 * n or any(r[i] >= r[i + n] for i in range(n)):
                 raise ValueError(
@@ -226,32 +278,34 @@ class Scene(_Part):
                     f"release[{k}] {release.lower} to {release.upper} leaves the domain "
                     f"{self.domain.lower} to {self.domain.upper}"
                 )
-            for j, other in enumerate(self.releases[:k]):
-                if release.overlaps(other):
+            for j, earlier in enumerate(self.releases[:k]):
+                if release.overlaps(earlier):
                     raise ValueError(
-                        f"release[{k}] {_span(release)} overlaps release[{j}] {_span(other)}"
+                        f"release[{k}] {_span(release)} overlaps release[{j}] {_span(earlier)}"
                     )
-        boxes: list[Box] = []
         for k, baffle in enumerate(self.baffles):
             if len(baffle.size) != dim:
                 raise ValueError(f"baffle[{k}].size needs {dim} numbers, got {baffle.size}")
             box = baffle.box(self.base)
+            # The corners of a turned baffle touch each face of the box that holds it.
             if not self.domain.contains(box):
                 raise ValueError(
-                    f"baffle[{k}] {box.lower} to {box.upper} leaves the domain "
+                    f"baffle[{k}] {box.lower} to {box.upper}{_turned(baffle)} leaves the domain "
                     f"{self.domain.lower} to {self.domain.upper}"
                 )
             for j, release in enumerate(self.releases):
-                if box.overlaps(release):
+                if _overlap(box, release, baffle, None):
                     raise ValueError(
-                        f"baffle[{k}] {_span(box)} overlaps release[{j}] {_span(release)}"
+                        f"baffle[{k}] {_span(box)}{_turned(baffle)} overlaps release[{j}] "
+                        f"{_span(release)}"
                     )
-            for j, other_box in enumerate(boxes):
-                if box.overlaps(other_box):
+            for j, other in enumerate(self.baffles[:k]):
+                other_box = other.box(self.base)
+                if _overlap(box, other_box, baffle, other):
                     raise ValueError(
-                        f"baffle[{k}] {_span(box)} overlaps baffle[{j}] {_span(other_box)}"
+                        f"baffle[{k}] {_span(box)}{_turned(baffle)} overlaps baffle[{j}] "
+                        f"{_span(other_box)}{_turned(other)}"
                     )
-            boxes.append(box)
         if self.section is not None and not (
             self.domain.lower[0] < self.section < self.domain.upper[0]
         ):
@@ -316,20 +370,60 @@ class Scene(_Part):
             return self.baffles[0].size
         raise SceneError("the scene has no baffle and no placement.size: which size to place?")
 
+    @property
+    def baffle_yaw(self) -> float:
+        """Yaw [degrees] of the baffles that a search places: the placement's, the first's, or 0."""
+        if self.placement is not None and self.placement.yaw is not None:
+            return self.placement.yaw
+        return self.baffles[0].yaw if self.baffles else 0.0
+
+    @property
+    def is_turned(self) -> bool:
+        """Whether a baffle stands askew to the axes."""
+        return any(baffle.unturned[1] for baffle in self.baffles)
+
     def baffle_boxes(self) -> np.ndarray:
-        """Lower and upper corners of the baffles [m], shape (B, 2, D)."""
+        """Lower and upper corners of the boxes along the axes that hold the baffles [m].
+
+        Shape (B, 2, D). An unturned baffle fills its box; of turned ones `oriented_boxes` tells.
+        """
         if not self.baffles:
             return np.zeros((0, 2, self.dim))
         boxes = [baffle.box(self.base) for baffle in self.baffles]
         return np.array([[box.lower, box.upper] for box in boxes])
 
+    def oriented_boxes(self) -> tuple[np.ndarray, np.ndarray]:
+        """The baffles as boxes turned about the vertical through their middle.
+
+        Returns:
+            lower and upper corners as they would stand unturned [m], shape (B, 2, D); and cosine
+            and sine of the yaw, shape (B, 2): (1, 0) for a baffle along the axes, which a baffle
+            by a quarter turn also is, with its sizes exchanged.
+        """
+        boxes, turns = self.baffle_boxes(), np.zeros((len(self.baffles), 2))
+        for k, baffle in enumerate(self.baffles):
+            yaw = baffle.unturned[1]
+            turns[k] = footprint.turn(yaw)
+            if yaw:
+                boxes[k] = _corners(baffle.model_copy(update={"yaw": 0.0}).box(self.base))
+        return boxes, turns
+
     def with_baffles(
-        self, centres: Sequence[Sequence[float]] | np.ndarray, size: Sequence[float] | None = None
+        self,
+        centres: Sequence[Sequence[float]] | np.ndarray,
+        size: Sequence[float] | Sequence[Sequence[float]] | np.ndarray | None = None,
+        yaw: float | Sequence[float] | np.ndarray | None = None,
     ) -> Scene:
-        """The same scene with baffles of one size at `centres` [m], shape (n, D-1), (x, z) in 3D.
+        """The same scene with baffles at `centres` [m], shape (n, D-1), (x, z) in 3D.
+
+        Args:
+            centres: in plan.
+            size: [m], shape (D,) for all or (n, D); default: `baffle_size`.
+            yaw: [degrees], one for all or shape (n,); default: `baffle_yaw`.
 
         Raises:
-            SceneError: if a baffle leaves the domain or overlaps a release or another baffle.
+            SceneError: if a baffle leaves the domain or overlaps a release or another baffle, or
+                sizes or yaws are not one for all nor one for each.
         """
         centres = np.asarray(centres, dtype=float)
         if centres.size == 0:
@@ -338,12 +432,22 @@ class Scene(_Part):
             raise SceneError(f"centres must have shape (n, {self.dim - 1}), got {centres.shape}")
         if not np.isfinite(centres).all():
             raise SceneError(f"centres must be finite, got {centres.tolist()}")
-        size = tuple(size) if size is not None else (self.baffle_size if len(centres) else ())
-        baffles = tuple({"center": tuple(map(float, c)), "size": size} for c in centres)
+        if size is None and len(centres):
+            size = self.baffle_size
+        sizes = _for_each(
+            size if len(centres) else np.zeros(self.dim), centres, (self.dim,), "size"
+        )
+        yaws = _for_each(self.baffle_yaw if yaw is None else yaw, centres, (), "yaw")
+        baffles = tuple(
+            {"center": tuple(map(float, c)), "size": tuple(map(float, s)), "yaw": float(y)}
+            for c, s, y in zip(centres, sizes, yaws, strict=True)
+        )
         placement = self.placement
-        if placement is not None and placement.size is None and self.baffles:
+        if placement is not None and self.baffles:
             # An emptied scene still knows what to place.
-            placement = placement.model_copy(update={"size": self.baffles[0].size})
+            first = {"size": self.baffles[0].size, "yaw": self.baffles[0].yaw or None}
+            unknown = {k: v for k, v in first.items() if getattr(placement, k) is None}
+            placement = placement.model_copy(update=unknown)
         return self._replaced(baffles=baffles, placement=placement)
 
     def replace(self, **changes: Any) -> Scene:
@@ -409,6 +513,36 @@ def write_whole(path: Path, content: bytes | memoryview) -> None:
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise
+
+
+def _for_each(values: Any, centres: np.ndarray, shape: tuple[int, ...], name: str) -> np.ndarray:
+    """One value of the given shape for every centre, from such values or from one for all."""
+    array = np.asarray(values, dtype=float)
+    if array.shape not in (shape, (len(centres), *shape)):
+        raise SceneError(
+            f"{name} must have shape {shape} for all {len(centres)} baffles or "
+            f"{(len(centres), *shape)}, got {array.shape}"
+        )
+    return np.broadcast_to(array, (len(centres), *shape))
+
+
+def _overlap(a: Box, b: Box, one: Baffle, other: Baffle | None) -> bool:
+    """Whether baffle `one` in box `a` shares volume with what is in `b`: baffle `other`, or all."""
+    if not a.overlaps(b):
+        return False
+    if not one.unturned[1] and (other is None or not other.unturned[1]):
+        return True
+    plan = np.array([[b.lower[0], b.lower[2]], [b.upper[0], b.upper[2]]])
+    around = other.corners if other else footprint.corners(plan.mean(0), plan[1] - plan[0])
+    return float(footprint.separation(one.corners, around)) < -TOLERANCE
+
+
+def _turned(baffle: Baffle) -> str:
+    return f" (turned by {baffle.yaw:g} degrees)" if baffle.unturned[1] else ""
+
+
+def _corners(box: Box) -> np.ndarray:
+    return np.array([box.lower, box.upper])
 
 
 def _span(box: Box) -> str:

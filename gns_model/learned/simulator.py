@@ -86,6 +86,10 @@ class LearnedSimulator:
                 f"{self.name} is a {self.config.dim}D model and the scene {scene.name!r} is "
                 f"{scene.dim}D"
             )
+        if scene.is_turned:
+            raise SimulatorError(
+                f"{self.name} does not yet simulate turned baffles: set their yaw to 0"
+            )
         if scene.baffles and self.config.baffles == "none":
             raise SimulatorError(
                 f"{self.name} does not see baffles, and the scene {scene.name!r} has "
