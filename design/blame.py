@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 from gns_env.layout import LayoutSpace
 from gns_model.errors import LayoutError
@@ -44,7 +45,11 @@ def _culprit(scene: Scene, n_baffles: int) -> str | None:
     if not to_blame:
         return None
     if to_blame == ["all"]:
-        return "the gap and the keep-outs are to blame together: without both they would fit"
+        names = [name for name, _ in _relaxed(bare.placement)][:-1]
+        return (
+            f"{', '.join(names[:-1])} and {names[-1]} are to blame together: without them they "
+            "would fit"
+        )
     to_blame = [name for name in to_blame if name != "all"]
     verb = "is" if len(to_blame) == 1 else "are each"
     return f"{' and '.join(to_blame)} {verb} to blame: without it they would fit"
@@ -52,17 +57,30 @@ def _culprit(scene: Scene, n_baffles: int) -> str | None:
 
 def _relaxed(placement: Placement) -> Iterator[tuple[str, Placement]]:
     """Placements with one constraint less, by its name; last, "all", without any."""
-    zones = placement.keep_out
-    if placement.gap > 0:
-        yield f"the gap of {placement.gap:g} m", placement.model_copy(update={"gap": 0.0})
-    if len(zones) <= MOST_KEEP_OUTS:
+    p = placement
+    free: dict[str, Any] = {}
+    for name, words, nothing in (
+        ("gap", f"the gap of {p.gap:g} m", 0.0),
+        ("wall_gap", f"wall_gap of {p.wall_gap:g} m", 0.0),
+        ("max_height", f"max_height of {p.max_height or 0:g} m", None),
+        ("max_volume", f"max_volume of {p.max_volume or 0:g}", None),
+    ):
+        if getattr(p, name):
+            free[name] = nothing
+            yield words, p.model_copy(update={name: nothing})
+    for name, words in (("keep_out", "keep-outs"), ("keep_out_polygons", "keep-out polygons")):
+        zones = getattr(p, name)
+        if not zones:
+            continue
+        free[name] = ()
+        if len(zones) > MOST_KEEP_OUTS:
+            yield f"the set of {words}", p.model_copy(update={name: ()})
+            continue
         for k in range(len(zones)):
             rest = tuple(zone for j, zone in enumerate(zones) if j != k)
-            yield f"keep_out[{k}]", placement.model_copy(update={"keep_out": rest})
-    else:
-        yield "the set of keep-outs", placement.model_copy(update={"keep_out": ()})
-    if placement.gap > 0 and zones:
-        yield "all", placement.model_copy(update={"gap": 0.0, "keep_out": ()})
+            yield f"{name}[{k}]", p.model_copy(update={name: rest})
+    if len(free) > 1 or sum(len(getattr(p, name)) for name in free if "keep" in name) > 1:
+        yield "all", p.model_copy(update=free)
 
 
 def _fits(scene: Scene, n_baffles: int) -> bool:

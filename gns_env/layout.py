@@ -4,10 +4,13 @@ Baffles of one size and yaw stand on the base. The footprint of turned ones is t
 rectangle along the axes that holds it: what is called buildable is so, and of the rest some could
 be built, too. A layout is buildable when
 
-- every whole footprint lies inside the placement rectangle, and so inside the domain;
+- every whole footprint lies inside the placement rectangle, and so inside the domain, and at least
+  `wall_gap` away from the walls of the domain;
 - any two footprints are at least `gap` clear of each other **along x or along z** (the distance of
   rectangles in the maximum norm: a passage of width `gap` opens between them along one axis);
-- no footprint overlaps a keep-out rectangle, or a release that reaches down to the baffle's height.
+- no footprint overlaps a keep-out rectangle or polygon, or a release that reaches down to the
+  baffle's height;
+- the baffles are no higher than `max_height` and no more than `max_volume` together.
 
 A scene without a placement gets everything downstream of the front, 5 cm off, with a gap of 5 cm.
 """
@@ -22,7 +25,8 @@ from numpy.typing import ArrayLike, NDArray
 from gns_env.projection import Projector
 from gns_env.room import free_rectangles, nearest_free, pack
 from gns_model.errors import LayoutError
-from gns_model.footprint import bounding_size
+from gns_model.footprint import bounding_size, corners
+from gns_model.polygon import clearance, strips
 from gns_model.scene import TOLERANCE, Box, Placement, Scene
 
 Array = NDArray[np.float64]
@@ -31,6 +35,8 @@ Array = NDArray[np.float64]
 DEFAULT_CLEARANCE = 0.05
 #: Clear gap of such a scene [m].
 DEFAULT_GAP = 0.05
+#: How far across the strips that stand for a keep-out polygon reach beyond it [m].
+STRIP = 0.05
 
 
 class LayoutSpace:
@@ -63,7 +69,7 @@ class LayoutSpace:
         self._footprint = self.size[[0, *range(2, scene.dim)]]
         if self.yaw:
             self._footprint = bounding_size(self._footprint, self.yaw)
-        self._area = np.array([placement.lower, placement.upper], dtype=float)
+        self._area = _area(scene, placement)
         self.lower, self.upper = (
             self._area[0] + self._footprint / 2,
             self._area[1] - self._footprint / 2,
@@ -74,6 +80,7 @@ class LayoutSpace:
         headroom = scene.domain.size[1]
         if self.size[1] > headroom + TOLERANCE:
             raise LayoutError(f"baffles {self.size[1]:g} m high exceed the domain's {headroom:g} m")
+        _check_limits(placement, self.size, self.n_baffles)
         if (self.upper < self.lower - TOLERANCE).any():
             raise LayoutError(
                 f"one baffle of {_metres(self._footprint)} is larger than the placement area of "
@@ -90,10 +97,19 @@ class LayoutSpace:
         self._blocked = np.array(
             [[lo - half, up + half] for _, lo, up in self._obstacles], dtype=float
         ).reshape(-1, 2, scene.dim - 1)
-        self._free = free_rectangles(np.array([self.lower, self.upper]), self._blocked)
+        self._polygons = [
+            (f"keep_out_polygons[{k}]", np.array(outline, dtype=float))
+            for k, outline in enumerate(placement.keep_out_polygons)
+        ]
+        # The machinery below knows rectangles: it gets strips that cover the polygons.
+        covers = [strips(outline, STRIP) for _, outline in self._polygons]
+        self._taken = np.concatenate(
+            [self._blocked, *(c + np.stack([-half, half]) for c in covers if len(c))]
+        )
+        self._free = free_rectangles(np.array([self.lower, self.upper]), self._taken)
         self._slots, most = pack(self._free, self.separation, self.n_baffles)
         if len(self._slots) < self.n_baffles:
-            names = ", ".join(name for name, _, _ in self._obstacles)
+            names = ", ".join([o[0] for o in self._obstacles] + [p[0] for p in self._polygons])
             besides = f" beside {names}" if names else ""
             raise LayoutError(
                 f"{self.n_baffles} baffles of {_metres(self._footprint)} with {self.gap:g} m clear "
@@ -151,6 +167,12 @@ class LayoutSpace:
         for (name, _, _), (lower, upper) in zip(self._obstacles, self._blocked, strict=True):
             inside = ((c > lower + TOLERANCE) & (c < upper - TOLERANCE)).all(1)
             faults += [f"baffle {k} overlaps {name}" for k in np.flatnonzero(inside)]
+        for name, outline in self._polygons:
+            faults += [
+                f"baffle {k} overlaps {name}"
+                for k, centre in enumerate(c)
+                if clearance(self._outline(centre), outline) < -TOLERANCE
+            ]
         return faults
 
     def project(self, centres: ArrayLike) -> Array:
@@ -223,8 +245,12 @@ class LayoutSpace:
         """Free rectangles for one more centre, shape (M, 2, D-1)."""
         taken = np.stack([stand - self.separation, stand + self.separation], axis=1)
         return free_rectangles(
-            np.array([self.lower, self.upper]), np.concatenate([self._blocked, taken])
+            np.array([self.lower, self.upper]), np.concatenate([self._taken, taken])
         )
+
+    def _outline(self, centre: Array) -> Array:
+        """Corners of the footprint about `centre` [m], shape (4, 2)."""
+        return corners(centre, self.size[[0, 2]], self.yaw)
 
     def as_centres(self, centres: ArrayLike) -> Array:
         """`centres` as a float array (k, D-1) [m], k >= 0.
@@ -257,6 +283,40 @@ def _default_placement(scene: Scene) -> Placement:
         upper=(end, *scene.domain.upper[2:]),
         gap=DEFAULT_GAP,
     )
+
+
+def _area(scene: Scene, placement: Placement) -> Array:
+    """Corners of the rectangle that holds all footprints [m], shape (2, D-1).
+
+    Raises:
+        LayoutError: if the distance to the walls leaves none of the placement.
+    """
+    plan = [0, *range(2, scene.dim)]
+    lower = np.array(scene.domain.lower)[plan] + placement.wall_gap
+    upper = np.array(scene.domain.upper)[plan] - placement.wall_gap
+    area = np.array(
+        [np.maximum(placement.lower, lower), np.minimum(placement.upper, upper)], dtype=float
+    )
+    if placement.wall_gap and (area[0] > area[1] + TOLERANCE).any():
+        raise LayoutError(
+            f"wall_gap {placement.wall_gap:g} m leaves nothing of the placement area of "
+            f"{_metres(np.array(placement.upper) - placement.lower)}"
+        )
+    return area if placement.wall_gap else np.array([placement.lower, placement.upper], dtype=float)
+
+
+def _check_limits(placement: Placement, size: Array, n_baffles: int) -> None:
+    if placement.max_height is not None and size[1] > placement.max_height + TOLERANCE:
+        raise LayoutError(
+            f"baffles {size[1]:g} m high exceed max_height {placement.max_height:g} m"
+        )
+    volume = n_baffles * float(np.prod(size))
+    if placement.max_volume is not None and volume > placement.max_volume * (1 + 1e-9):
+        unit = "m³" if len(size) == 3 else "m² (per metre of width)"
+        raise LayoutError(
+            f"{n_baffles} baffles of {_metres(size)} take {volume:.4g} {unit}, more than "
+            f"max_volume {placement.max_volume:g}"
+        )
 
 
 def _obstacles(scene: Scene, placement: Placement, height: float) -> list[tuple[str, Array, Array]]:
