@@ -75,7 +75,8 @@ def sampler(campaign: Campaign, kind: str) -> optuna.samplers.BaseSampler:
     """
     rng = campaign.rng()
     seed = int(rng.integers(2**31))
-    startup = max(LEAST_STARTUP, 2 * campaign.space.dim)
+    # A model that knows little is better than no model: chance has half of the budget at most.
+    startup = min(max(LEAST_STARTUP, 2 * campaign.space.dim), max(campaign.passes // 2, 1))
     model: optuna.samplers.BaseSampler
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)

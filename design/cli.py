@@ -41,7 +41,7 @@ def optimize(
     method: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option(
-            help="random, rows, tpe, gp, nsga2, bayes (gp or tpe by budget), gradient or hybrid; "
+            help="random, rows, tpe, gp, nsga2, bayes (gp or tpe by budget), gradient (Adam), lbfgs or hybrid; "
             "default: hybrid where the simulator has a gradient."
         ),
     ] = None,

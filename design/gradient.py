@@ -1,9 +1,9 @@
-"""Gradient search: autograd through the whole rollout, projected Adam steps, several starts.
+"""Gradient search: autograd through the whole rollout, chains of projected steps, several starts.
 
 A gradient costs one forward rollout and one backward pass (with a checkpoint a step, about three
-forwards of time), so steps are few and chosen: every step is projected onto the buildable layouts
-by cvxpy, and a chain that stops improving goes back to its best layout with half the step. Smooth
-measures steer; the hard measures of the same rollout decide what is best.
+forwards of time), so steps are few and chosen (`chains`): every step is projected onto the
+buildable layouts by cvxpy. Smooth measures steer; the hard measures of the same rollout decide what
+is best.
 """
 
 from __future__ import annotations
@@ -11,17 +11,17 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from design.baselines import engineering_layouts, random_layouts
 from design.campaign import Campaign
+from design.chains import LEAST_STEP, STEP, Adam, Chain, Lbfgs
 from design.distinct import apart
 from design.risk import Flow, Risk, weigh
 from design.trials import Outcome
-from gns_env.layout import LayoutSpace
 from gns_env.task import BaffleTask
 from gns_model import measures as hard
 from gns_model.errors import SimulatorError
@@ -33,19 +33,22 @@ from gns_model.trajectory import DIVERGED, OK, Trajectory
 if TYPE_CHECKING:
     from torch import Tensor
 
-#: First step of a chain [m], a fifth of the paper's baffle: the most that a coordinate moves.
-STEP = 0.03
-#: Steps shorter than this end a chain [m]: less than anybody builds to.
-LEAST_STEP = 0.003
-#: A chain ends where the constraints take all but this share of its step.
-HELD = 0.02
-#: Decay of Adam's running means; short memories, since a chain has few steps.
-BETA_MEAN, BETA_SQUARE = 0.7, 0.9
-#: Chains of a pure gradient search.
-STARTS = 4
+#: Most chains of a pure gradient search, and the fewest gradients that each should get: long chains
+#: from few starts beat single steps from many.
+STARTS, LEAST_GRADIENTS = 4, 3
 
 
 def search(campaign: Campaign) -> None:
+    """Projected Adam from the best starts; see `_search`."""
+    _search(campaign, Adam)
+
+
+def lbfgs(campaign: Campaign) -> None:
+    """Projected L-BFGS from the best starts; see `_search`."""
+    _search(campaign, Lbfgs)
+
+
+def _search(campaign: Campaign, kind: type[Chain]) -> None:
     """Run the starts, then chains of steps from the best of them until the budget is spent.
 
     Starts are the engineering layouts and as many random ones as chains. When all chains have ended
@@ -56,8 +59,9 @@ def search(campaign: Campaign) -> None:
     """
     require_gradient(campaign)
     log, space = campaign.log, campaign.space
+    count = min(STARTS, max(campaign.passes // 2 // (2 * LEAST_GRADIENTS), 1))
     if not any(t.origin != "scene" for t in log.trials()):
-        starts = [*engineering_layouts(space), *random_layouts(space, STARTS, campaign.rng(1))]
+        starts = [*engineering_layouts(space), *random_layouts(space, count, campaign.rng(1))]
         # At least half of the budget is for steps.
         starts = starts[: max(campaign.left() // 2, 1)]
         campaign.run(starts)
@@ -65,11 +69,11 @@ def search(campaign: Campaign) -> None:
     while campaign.left() >= 2:
         if first:
             ranked = sorted((t for t in log.trials() if t.ok), key=lambda t: t.cost)
-            origins = apart([t.centres for t in ranked], STEP, STARTS)
+            origins = apart([t.centres for t in ranked], STEP, count)
         else:
-            origins = [c for _, c in random_layouts(space, STARTS, campaign.rng(2))]
+            origins = [c for _, c in random_layouts(space, count, campaign.rng(2))]
         first = False
-        descend(campaign, origins, campaign.left())
+        descend(campaign, origins, campaign.left(), kind)
 
 
 def require_gradient(campaign: Campaign) -> None:
@@ -81,9 +85,11 @@ def require_gradient(campaign: Campaign) -> None:
         )
 
 
-def descend(campaign: Campaign, starts: Sequence[np.ndarray], budget: int) -> None:
+def descend(
+    campaign: Campaign, starts: Sequence[np.ndarray], budget: int, kind: type[Chain] = Adam
+) -> None:
     """Step all chains together from `starts` [m], shape (n, D-1), within `budget` passes."""
-    chains = [Chain(campaign.space, start) for start in starts]
+    chains = [kind(campaign.space, start) for start in starts]
     while chains and budget >= 2:
         chains = chains[: budget // 2]
         budget -= 2 * len(chains)
@@ -92,71 +98,6 @@ def descend(campaign: Campaign, starts: Sequence[np.ndarray], budget: int) -> No
             campaign.record("gradient", layouts[k], outcome)
             chains[k].learn(outcome)
         chains = [chain for chain in chains if chain.step >= LEAST_STEP]
-
-
-class Chain:
-    """One start of projected Adam. `centres` is the layout to differentiate next.
-
-    Adam's direction is scaled so that the largest move of a coordinate is at most `step`.
-    """
-
-    def __init__(self, space: LayoutSpace, centres: np.ndarray, step: float = STEP) -> None:
-        self._space = space
-        self.centres = np.array(centres, dtype=float)
-        self.step = step
-        self.best_cost = np.inf
-        self._best = self.centres
-        self._best_gradient: np.ndarray | None = None
-        self._misses = 0
-        self._mean: np.ndarray = np.zeros_like(self.centres)
-        self._square, self._count = 0.0, 0
-
-    def learn(self, outcome: Outcome) -> None:
-        """Take in the outcome at `centres` and move on."""
-        gradient = outcome.gradient
-        usable = outcome.status == OK and gradient is not None and np.isfinite(gradient).all()
-        if usable and outcome.cost < self.best_cost:
-            self.best_cost, self._best, self._best_gradient = outcome.cost, self.centres, gradient
-            self._misses = 0
-        else:
-            self._misses += 1
-            if not usable or self._misses >= 2:
-                # Back to the best layout with a shorter step and no memory of the way.
-                self.step /= 2
-                self._misses = 0
-                self._forget()
-                if self._best_gradient is None:  # the start itself failed
-                    self.step = 0.0
-                    return
-                self.centres, gradient = self._best, self._best_gradient
-        assert gradient is not None
-        self._move(self._direction(gradient))
-
-    def _move(self, step: np.ndarray) -> None:
-        """Go against `step` [m], shape (n, D-1), as far as the constraints allow."""
-        moved = self._space.project(self.centres - step) - self.centres
-        most = np.abs(moved).max()
-        if most < HELD * self.step:
-            self.step = 0.0  # a local optimum
-            return
-        if most < self.step / 2:
-            # What is held had set the scale: go on along what the constraints leave free.
-            moved = self._space.project(self.centres + moved * (self.step / most)) - self.centres
-        self.centres = self.centres + moved
-
-    def _direction(self, gradient: np.ndarray) -> np.ndarray:
-        self._count += 1
-        self._mean = BETA_MEAN * self._mean + (1 - BETA_MEAN) * gradient
-        # One scale for all coordinates: a baffle that does not matter should not move.
-        square = float(np.square(gradient).max())
-        self._square = BETA_SQUARE * self._square + (1 - BETA_SQUARE) * square
-        mean = self._mean / (1 - BETA_MEAN**self._count)
-        scale = np.sqrt(self._square / (1 - BETA_SQUARE**self._count))
-        return np.clip(self.step * mean / max(scale, 1e-12), -self.step, self.step)
-
-    def _forget(self) -> None:
-        self._mean = np.zeros_like(self.centres)
-        self._square, self._count = 0.0, 0
 
 
 def cost_and_gradient(
@@ -183,7 +124,7 @@ def cost_and_gradient(
     if not hasattr(task.simulator, "rollout_tensor"):
         raise SimulatorError(f"the simulator {task.simulator.name!r} has no gradient")
     centres = torch.tensor(task.space.as_centres(layout).copy(), requires_grad=True)
-    _, costs = _smooth_costs(task, [centres], limit)
+    _, costs = smooth_costs(task, [centres], limit=limit)
     costs.sum().backward()
     cost = float(costs.detach().sum())
     gradient = None if centres.grad is None else centres.grad.numpy()
@@ -192,16 +133,35 @@ def cost_and_gradient(
     return cost, gradient
 
 
-def _smooth_costs(
-    task: BaffleTask, centres: Sequence[Tensor], limit: float | None
+def smooth_costs(
+    task: BaffleTask,
+    centres: Sequence[Tensor],
+    *,
+    limit: float | None = ADJOINT_LIMIT,
+    draws: Sequence[int] | None = None,
 ) -> tuple[list[Tensor], Tensor]:
-    """Positions (T, N, D) and the smooth cost of each layout (n, D-1), shape (layouts,)."""
+    """Positions (T, N, D) and the smooth cost of each layout (n, D-1), shape (layouts,).
+
+    Args:
+        task: with a simulator that has a gradient.
+        centres: of each layout [m], shape (n, D-1); may require grad.
+        limit: as `cost_and_gradient`.
+        draws: the start of each layout (`LearnedSimulator.perturbed_start`); default: the usual.
+    """
     import torch
 
     from gns_model.smooth_measures import smooth_measures
 
     scenes = [task.scene_with(c.detach().numpy()) for c in centres]
-    rollouts = task.simulator.rollout_tensor(scenes, centres, limit=limit)  # type: ignore[attr-defined]
+    simulator: Any = task.simulator
+    noise = None
+    if draws is not None and any(draws):
+        noise = [
+            simulator.perturbed_start(scene, draw)
+            for scene, draw in zip(scenes, draws, strict=True)
+        ]
+    more = {} if noise is None else {"noise": noise}
+    rollouts = simulator.rollout_tensor(scenes, centres, limit=limit, **more)
     reference, size = task.reference, tuple(task.space.size)
     costs = []
     for positions, scene, c in zip(rollouts, scenes, centres, strict=True):
@@ -247,7 +207,7 @@ def _differentiate(
     import torch
 
     centres = [torch.tensor(np.asarray(c, dtype=np.float64), requires_grad=True) for c in layouts]
-    rollouts, costs = _smooth_costs(task, centres, ADJOINT_LIMIT)
+    rollouts, costs = smooth_costs(task, centres)
     costs.sum().backward()
     return [_flow(task, p, c) for p, c in zip(rollouts, centres, strict=True)]
 

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from design import bayes
 from design.campaign import Campaign
+from design.chains import STEP
 from design.distinct import apart
-from design.gradient import STEP, descend, require_gradient
+from design.gradient import descend, require_gradient
 
 #: Share of the budget that is sampled before the first leap, and the share of each leap. A gradient
 #: takes about four rollouts of time and counts two, so leaps are the smaller part.

@@ -14,11 +14,12 @@ METHODS: dict[str, Search] = {
     "gp": bayes.gp,
     "nsga2": bayes.nsga2,
     "gradient": gradient.search,
+    "lbfgs": gradient.lbfgs,
     "hybrid": hybrid.search,
 }
 
 #: Methods that follow gradients: of one cost, through a simulator that has them.
-FOLLOW = ("gradient", "hybrid")
+FOLLOW = ("gradient", "lbfgs", "hybrid")
 
 
 class MethodError(SimulatorError, ValueError):

@@ -94,8 +94,8 @@ def optimize(
 
     Args:
         task: what to search; with several objectives, for their Pareto front.
-        method: "random", "rows", "bayes", "tpe", "gp", "nsga2", "gradient" or "hybrid"; default:
-            hybrid where the simulator has a gradient, else bayes.
+        method: "random", "rows", "bayes", "tpe", "gp", "nsga2", "gradient", "lbfgs" or "hybrid";
+            default: hybrid where the simulator has a gradient, else bayes.
         budget: passes through a rollout; a backward pass counts like a forward one. The flow
             without baffles comes on top.
         seed: of everything random.

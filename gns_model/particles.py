@@ -41,15 +41,16 @@ class Points:
         return self.spacing ** self.positions.shape[1]
 
 
-def scatter(points: Points, subcells: int) -> Points:
+def scatter(points: Points, subcells: int, draw: int = 0) -> Points:
     """Move every point to the middle of a random one of subcells^D equal parts of its cell.
 
     So the points of a coarse model start as a random choice of a finer solver's points, one in
-    each cell, which moves as the whole does. The choice is the same for the same number of points.
+    each cell, which moves as the whole does. The choice is the same for the same number of points
+    and the same `draw`.
     """
     if subcells == 1:
         return points
-    part = np.random.default_rng(0).integers(0, subcells, points.positions.shape)
+    part = np.random.default_rng(draw).integers(0, subcells, points.positions.shape)
     offset = (part + 0.5) / subcells - 0.5
     return replace(points, positions=points.positions + points.spacing * offset)
 

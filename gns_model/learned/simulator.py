@@ -27,6 +27,9 @@ from gns_model.trajectory import DIVERGED, OK, Trajectory
 #: once cost 10% more than one after the other, four 20% (one thread). A GPU wants to be filled.
 BATCH_POINTS = {"cpu": 6_000, "cuda": 400_000}
 
+#: Share of the spacing by which a perturbed start displaces the points of a lattice.
+PERTURBATION = 0.05
+
 
 class LearnedSimulator:
     """A trained model as a simulator.
@@ -114,6 +117,22 @@ class LearnedSimulator:
 
     def _fill(self, scene: Scene) -> Points:
         return scatter(fill(scene, self.config.spacing), self.config.subcells)
+
+    def perturbed_start(self, scene: Scene, draw: int) -> Tensor:
+        """Displacements [m], shape (N, D), to another start of the same flow, for `noise`.
+
+        Draw 0 is the usual start. A model of mixed tracers starts from another random choice of
+        them (`particles.scatter`); one that starts on a lattice has its points shifted by up to
+        `PERTURBATION` of the spacing.
+        """
+        points = fill(scene, self.config.spacing)
+        if self.config.subcells > 1:
+            usual, other = (scatter(points, self.config.subcells, d).positions for d in (0, draw))
+            shift = other - usual
+        else:
+            most = PERTURBATION * self.config.spacing if draw else 0.0
+            shift = np.random.default_rng(draw).uniform(-most, most, points.positions.shape)
+        return torch.from_numpy(shift).to(**place(self.model))
 
     # -- rollouts ------------------------------------------------------------------------------
 
