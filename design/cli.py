@@ -41,8 +41,8 @@ def optimize(
     method: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option(
-            help="random, rows, tpe, gp, nsga2, bayes (gp or tpe by budget), gradient (Adam), lbfgs or hybrid; "
-            "default: hybrid where the simulator has a gradient."
+            help="random, rows, tpe, gp, nsga2, bayes (gp or tpe by budget), gradient (Adam), "
+            "lbfgs or hybrid; default: hybrid where the simulator has a gradient."
         ),
     ] = None,
     baffles: Annotated[
