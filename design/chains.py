@@ -96,6 +96,9 @@ class Adam(Chain):
 
     #: Decay of the running means; short memories, since a chain has few steps.
     beta_mean, beta_square = 0.7, 0.9
+    _mean: np.ndarray
+    _square: float
+    _count: int
 
     def _direction(self, gradient: np.ndarray) -> np.ndarray:
         self._count += 1
@@ -124,6 +127,8 @@ class Lbfgs(Chain):
     memory = 5
     #: Least cosine of s and y: below, their curvature is roughness and not shape.
     least_cosine = 0.05
+    _pairs: list[tuple[np.ndarray, np.ndarray]]
+    _last: tuple[np.ndarray, np.ndarray] | None
 
     def _observe(self, gradient: np.ndarray) -> None:
         if self._last is not None:
@@ -156,5 +161,4 @@ class Lbfgs(Chain):
         self._last = self._best, self._best_gradient
 
     def _forget(self) -> None:
-        self._pairs: list[tuple[np.ndarray, np.ndarray]] = []
-        self._last: tuple[np.ndarray, np.ndarray] | None = None
+        self._pairs, self._last = [], None
