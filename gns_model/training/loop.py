@@ -19,9 +19,10 @@ from gns_model.training.distributed import RankError, Ranks, session
 from gns_model.training.feeding import Feeder
 from gns_model.training.heap import release_heap
 from gns_model.training.launching import end_with_launcher
-from gns_model.training.loss import unrolled_loss
+from gns_model.training.loss import step_error, unrolled_loss
 from gns_model.training.progress import Display
 from gns_model.training.recipe import Recipe
+from gns_model.training.replay import Replay
 from gns_model.training.schedule import learning_rate
 from gns_model.training.setup import Run, begin, card, open_data
 from gns_model.training.state import FILE, save_state
@@ -104,6 +105,8 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: Stop) ->
         if ranks.rank == 0:
             save("last", None)
             save_state(state_file, position, model, average, optimiser)
+        if recipe.replay:
+            replay.save(out, position.step)
 
     def validate() -> bool:
         """Whether it was finished."""
@@ -143,12 +146,17 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: Stop) ->
             )
         on_gpu = ranks.device.type == "cuda"
         feeder = Feeder(data, recipe, position.statistics, ranks, ahead=on_gpu)
+        replay = Replay(data, recipe, position.statistics, ranks)
+        if recipe.replay and position.step:
+            replay.restore(out, position.step)
         try:
             while (done := position.step if recipe.steps else position.seconds) < budget:
                 began = time.perf_counter()
                 progress = done / budget
                 with stop.may_abandon():
-                    loss, edges = _forward_and_backward(run, recipe, feeder, ranks, progress)
+                    loss, edges = _forward_and_backward(
+                        run, recipe, feeder, replay, ranks, progress
+                    )
                 rate = learning_rate(recipe, position.step, progress)
 
                 # One message carries the gradients and all that the ranks have to agree on.
@@ -173,6 +181,7 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: Stop) ->
                         group["lr"] = rate
                     optimiser.step()
                     average.update(model, position.step)
+                replay.keep()
                 bad = 0 if finite else bad + 1
                 position.step += 1
                 position.seconds = seconds
@@ -223,7 +232,7 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: Stop) ->
 
 
 def _forward_and_backward(
-    run: Run, recipe: Recipe, feeder: Feeder, ranks: Ranks, progress: float
+    run: Run, recipe: Recipe, feeder: Feeder, replay: Replay, ranks: Ranks, progress: float
 ) -> tuple[Tensor, float]:
     """Loss of this rank's windows of the next step, with its gradients in the parameters.
 
@@ -231,24 +240,41 @@ def _forward_and_backward(
         the loss, a scalar, and the number of edges.
     """
     step = run.position.step
-    windows, edges = feeder.take(step, progress)
-    batch = batches.collate(
-        windows,
-        noise_std=run.model.config.noise_std,
-        rng=batches.generator(recipe.seed, batches.NOISE, step, ranks.rank),
-        device=ranks.device,
-    )
     autocast = recipe.precision == "bfloat16"
-    with torch.autocast(ranks.device.type, torch.bfloat16) if autocast else nullcontext():
-        loss = unrolled_loss(
-            run.model,
-            batch,
-            steps=feeder.unroll(step, progress),
-            backprop=recipe.backprop_through_unroll,
-            linear_beyond=recipe.linear_beyond,
-            momentum_weight=recipe.momentum_weight,
-            return_steps=recipe.return_steps,
+    context = torch.autocast(ranks.device.type, torch.bfloat16) if autocast else nullcontext()
+    if recipe.replay and progress >= 1 - recipe.unroll_fraction:
+        batch, edges = replay.take(step)
+        with context:
+            after = run.model.step(batch.history, batch.world)
+            loss = step_error(
+                run.model,
+                batch.history,
+                after,
+                batch.moves[:, 0],
+                batch=batch.world.batch,
+                moving=batch.moving,
+                linear_beyond=recipe.linear_beyond,
+                momentum_weight=recipe.momentum_weight,
+            )
+        replay.advanced(after)
+    else:
+        windows, edges = feeder.take(step, progress)
+        batch = batches.collate(
+            windows,
+            noise_std=run.model.config.noise_std,
+            rng=batches.generator(recipe.seed, batches.NOISE, step, ranks.rank),
+            device=ranks.device,
         )
+        with context:
+            loss = unrolled_loss(
+                run.model,
+                batch,
+                steps=feeder.unroll(step, progress),
+                backprop=recipe.backprop_through_unroll,
+                linear_beyond=recipe.linear_beyond,
+                momentum_weight=recipe.momentum_weight,
+                return_steps=recipe.return_steps,
+            )
     run.optimiser.zero_grad(set_to_none=True)
     loss.backward()
     return loss, edges

@@ -73,6 +73,10 @@ class Recipe(BaseModel):
     unroll_fraction: Fraction = 0.0  #: last part of the budget that is unrolled
     #: Steps in which the unrolled phase asks the model to make up for its drift; see `loss`.
     return_steps: Annotated[float, Field(ge=1, allow_inf_nan=False)] | None = None
+    #: Flows that each rank keeps rolling by the model itself in the unrolled phase, in place of K
+    #: steps for every window, and the most steps of one; see `replay`. 0: none.
+    replay: Annotated[int, Field(ge=0)] = 0
+    replay_steps: Count = 40
     #: Let gradients flow through all K steps; else only through each step's own (push-forward).
     backprop_through_unroll: bool = False
 
@@ -88,6 +92,10 @@ class Recipe(BaseModel):
     def _consistent(self) -> Recipe:
         if (self.steps is None) == (self.minutes is None):
             raise ValueError("give either steps or minutes, one of the two")
+        if self.replay and self.return_steps is None:
+            raise ValueError(
+                "replay needs return_steps: how fast a flow is asked back to the truth"
+            )
         if 0 < self.model.types <= MOVING:
             raise ValueError(
                 f"model.types must be 0 or at least {MOVING + 1}; moving points have type {MOVING}"

@@ -1,0 +1,217 @@
+"""Flows that the model itself keeps rolling while it is trained.
+
+A model that sees true states only is one-step perfect and goes astray by itself: a heap sinks by a
+hair each step and is a puddle after fifty, a front lags. Unrolling K steps for every gradient shows
+K steps of that and costs K times as much. Here a pool of flows goes on instead: every optimiser
+step advances some of them by one step of the model, with the gradient of that very step, so that
+states of any age cost no more than true ones (dataset aggregation, Ross et al. 2011, for rollouts).
+
+What is asked of a state that has drifted is the true acceleration and the way back, critically
+damped: with e(t) = x - x_true of a point and tau = `return_steps` dt,
+
+    a = a_true - 2 e'/tau - e/tau².
+
+Asking for the true place in the next step instead would ask for accelerations of e/dt², which are
+tens of g for the wanderings of single grains that nobody can foretell.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
+from torch import Tensor
+
+from gns_model.data.windows import Window, WindowIndex
+from gns_model.scene import write_whole
+from gns_model.training import batches
+from gns_model.training.batches import Batch, Draw
+from gns_model.training.distributed import Ranks
+from gns_model.training.kinematic import kinematic_spacing
+from gns_model.training.recipe import Recipe
+from gns_model.training.statistics import Statistics
+
+#: A flow whose points have strayed this far on average is let go [spacings].
+ASTRAY = 6.0
+
+
+@dataclass
+class Rolling:
+    """One flow under way.
+
+    Attributes:
+        draw: its source, mixture of tracers and present frame.
+        left: steps until it is let go.
+        history: the model's positions [m], shape (N, H+1, D); None: it begins with the true ones.
+    """
+
+    draw: Draw
+    left: int
+    history: np.ndarray | None = None
+
+
+class Replay:
+    """This rank's flows. What is drawn follows from the seed and from how many were drawn before.
+
+    Args:
+        data: where flows begin, and what they should have done.
+        recipe: `replay` flows are kept, for up to `replay_steps` steps each.
+    """
+
+    def __init__(
+        self, data: WindowIndex, recipe: Recipe, statistics: Statistics, ranks: Ranks
+    ) -> None:
+        self._data, self._recipe, self._statistics = data, recipe, statistics
+        self._ranks = ranks
+        self._kinematic = kinematic_spacing(recipe.model)
+        self.drawn = 0
+        self.flows: list[Rolling] = []
+        self._taken: list[tuple[Rolling, Window]] = []
+        self._after: Tensor | None = None
+
+    def take(self, step: int) -> tuple[Batch, float]:
+        """The flows of optimiser step `step` as a batch, and about how many edges it has.
+
+        The batch's history is the model's own, and its one move leads towards the truth.
+        """
+        recipe = self._recipe
+        while len(self.flows) < recipe.replay:
+            self.flows.append(self._begin())
+        self._taken, edges = [], 0.0
+        for flow in self.flows:
+            if self._taken and edges + flow.draw.edges / 2 > recipe.edges_per_batch:
+                break
+            edges += flow.draw.edges
+            truth = batches.read(self._data, flow.draw, unroll=1, kinematic=self._kinematic)
+            if flow.history is None:
+                rng = self._rng(batches.NOISE, step, len(self._taken))
+                flow.history = _noisy(truth, recipe.model.noise_std, rng)
+            self._taken.append((flow, truth))
+        own = []
+        for flow, truth in self._taken:
+            assert flow.history is not None
+            move = wish(flow.history, truth, recipe.return_steps or 1.0)
+            after = flow.history[:, -1:] + move[:, None]
+            own.append(dataclasses.replace(truth, history=flow.history, future=after))
+        batch = batches.collate(
+            own, noise_std=0.0, rng=self._rng(batches.NOISE, step), device=self._ranks.device
+        )
+        return batch, edges
+
+    def advanced(self, after: Tensor) -> None:
+        """What the model makes of the flows taken: positions [m], shape (N, D)."""
+        self._after = after.detach()
+
+    def keep(self) -> None:
+        """Go on from there, once the step counts; a step that is abandoned leaves no trace."""
+        if self._after is None:
+            return
+        positions = self._after.float().cpu().numpy()
+        flows, start = self.flows[len(self._taken) :], 0
+        for flow, truth in self._taken:
+            assert flow.history is not None
+            now = positions[start : start + len(flow.history)]
+            start += len(now)
+            frame = flow.draw.frame + self._data.stride(flow.draw.source)
+            strayed = np.abs(now - truth.future[:, 0]).mean()
+            if (
+                flow.left <= 1
+                or not strayed <= ASTRAY * self._recipe.model.spacing
+                or frame >= self._data.starts(flow.draw.source, 1)
+            ):
+                flows.append(self._begin())
+                continue
+            history = np.concatenate([flow.history[:, 1:], now[:, None]], axis=1)
+            draw = dataclasses.replace(flow.draw, frame=frame)
+            flows.append(Rolling(draw, flow.left - 1, history))
+        self.flows, self._after = flows, None
+
+    # -- files ---------------------------------------------------------------------------------
+
+    def save(self, folder: Path, step: int) -> None:
+        """Write the flows whole, beside the state of the same step."""
+        tensors = {str(k): f.history for k, f in enumerate(self.flows) if f.history is not None}
+        about = [[dataclasses.asdict(f.draw), f.left] for f in self.flows]
+        metadata = {"step": str(step), "drawn": str(self.drawn), "flows": json.dumps(about)}
+        write_whole(folder / self._file, save(tensors, metadata=metadata))
+
+    def restore(self, folder: Path, step: int) -> None:
+        """Go on with what `save` wrote at `step`; with new flows if that is not what there is.
+
+        A run that was killed between two files, or goes on with other data, loses no more than
+        that: flows begin again from true states.
+        """
+        try:
+            content = (folder / self._file).read_bytes()
+            tensors = load(content)
+            size = int.from_bytes(content[:8], "little")
+            metadata = json.loads(content[8 : 8 + size])["__metadata__"]
+            if int(metadata["step"]) != step:
+                return
+            flows = [
+                Rolling(Draw(**draw), left, tensors.get(str(k)))
+                for k, (draw, left) in enumerate(json.loads(metadata["flows"]))
+            ]
+            drawn = int(metadata["drawn"])
+        except (OSError, SafetensorError, KeyError, TypeError, ValueError):
+            return
+        if all(self._known(f) for f in flows):
+            self.flows, self.drawn = flows, drawn
+
+    def _known(self, flow: Rolling) -> bool:
+        source = flow.draw.source
+        return source < len(self._data.sources) and flow.draw.frame < self._data.starts(source, 1)
+
+    @property
+    def _file(self) -> str:
+        return f"replay-{self._ranks.rank}.safetensors"
+
+    def _begin(self) -> Rolling:
+        recipe = self._recipe
+        rng = self._rng(batches.UNROLL, self.drawn)
+        self.drawn += 1
+        [[draw]] = batches.draw(
+            self._data,
+            rng,
+            ranks=1,
+            edges_per_batch=1,
+            statistics=self._statistics,
+            mirror=recipe.mirror,
+            early=recipe.early,
+            early_steps=recipe.early_steps,
+        )
+        return Rolling(draw, int(rng.integers(1, recipe.replay_steps + 1)))
+
+    def _rng(self, purpose: int, *numbers: int) -> np.random.Generator:
+        return np.random.default_rng([self._recipe.seed, purpose, *numbers, self._ranks.rank])
+
+
+def wish(history: np.ndarray, window: Window, return_steps: float) -> np.ndarray:
+    """The displacement to ask for [m], shape (N, D): the module's equation, times dt², and v dt.
+
+    Args:
+        history: the model's positions [m], shape (N, H+1, D).
+        window: the truth at the same frame, with one step of future.
+    """
+    truth = window.history
+    error, before = history[:, -1] - truth[:, -1], history[:, -2] - truth[:, -2]
+    acceleration = window.future[:, 0] - 2 * truth[:, -1] + truth[:, -2]
+    back = 2 * (error - before) / return_steps + error / return_steps**2
+    move: np.ndarray = history[:, -1] - history[:, -2] + acceleration - back
+    return move.astype(np.float32)
+
+
+def _noisy(window: Window, std: float, rng: np.random.Generator) -> np.ndarray:
+    """The true history of a flow that begins, with the noise of the training."""
+    moving = window.particle_type != batches.STATIONARY
+    points, frames, dim = window.history.shape
+    if std == 0:
+        return window.history
+    walk = batches.random_walk(rng, points, frames - 1, dim, std)
+    noisy: np.ndarray = (window.history + walk * moving[:, None, None]).astype(np.float32)
+    return noisy
