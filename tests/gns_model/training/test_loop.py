@@ -76,9 +76,14 @@ def test_the_best_model_is_kept(tiny, tmp_path):
     assert card["trained_on"]["steps"] == best["step"]
 
 
-def test_resume_is_bit_exact_after_a_signal(tiny, tmp_path, monkeypatch, same_state):
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"replay": 5, "replay_steps": 3, "return_steps": 4, "unroll_fraction": 1.0}],
+    ids=["windows", "replay"],
+)
+def test_resume_is_bit_exact_after_a_signal(tiny, tmp_path, monkeypatch, same_state, options):
     """Six steps at once, and three, SIGTERM, three: the same weights, average and moments."""
-    recipe = Recipe.from_dict(tiny)
+    recipe = Recipe.from_dict({**tiny, **options})
     train(recipe, tmp_path / "whole")
 
     step = Display.step
