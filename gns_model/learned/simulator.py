@@ -42,6 +42,8 @@ class LearnedSimulator:
         workers: processes that share the scenes of a rollout, on the CPU, one thread each.
         precision: "bfloat16" makes the products over edges in that dtype: a little faster on a
             CPU, much on a GPU, at half a percent of error in each step's acceleration.
+        filling: seed of the places in their cells that points start from; of no effect on a model
+            without `subcells`.
     """
 
     def __init__(
@@ -53,6 +55,7 @@ class LearnedSimulator:
         threads: int | None = None,
         workers: int = 1,
         precision: str = "float32",
+        filling: int = 0,
     ) -> None:
         if precision not in ("float32", "bfloat16"):
             raise SimulatorError(f"precision must be float32 or bfloat16, got {precision!r}")
@@ -66,6 +69,7 @@ class LearnedSimulator:
         self.threads = threads
         self.workers = workers
         self.precision = precision
+        self.filling = filling
         self._warned: set[str] = set()
         self._pool: Any = None
 
@@ -116,7 +120,7 @@ class LearnedSimulator:
                 )
 
     def _fill(self, scene: Scene) -> Points:
-        return scatter(fill(scene, self.config.spacing), self.config.subcells)
+        return scatter(fill(scene, self.config.spacing), self.config.subcells, self.filling)
 
     def perturbed_start(self, scene: Scene, draw: int) -> Tensor:
         """Displacements [m], shape (N, D), to another start of the same flow, for `noise`.

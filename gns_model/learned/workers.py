@@ -42,7 +42,12 @@ class WorkerPool:
             workers,
             mp_context=multiprocessing.get_context("spawn"),
             initializer=_start,
-            initargs=(config.model_dump_json(), state, simulator.name, simulator.precision),
+            initargs=(
+                config.model_dump_json(),
+                state,
+                simulator.name,
+                {"precision": simulator.precision, "filling": simulator.filling},
+            ),
         )
 
     def rollout(self, scenes: Sequence[Scene], progress: Progress | None) -> list[Trajectory]:
@@ -84,14 +89,14 @@ class WorkerPool:
             process.terminate()
 
 
-def _start(config: str, state: dict[str, Any], name: str, precision: str) -> None:
+def _start(config: str, state: dict[str, Any], name: str, options: dict[str, Any]) -> None:
     global _simulator
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends us
     torch.set_num_threads(1)
     model = LearnedModel(ModelConfig.model_validate_json(config))
     model.to(torch.from_numpy(state["velocity_std"]).dtype)
     model.load_state_dict({k: torch.from_numpy(v) for k, v in state.items()})
-    _simulator = LearnedSimulator(model, name, precision=precision)
+    _simulator = LearnedSimulator(model, name, **options)
 
 
 def _rollout(scenes: list[dict[str, Any]]) -> list[Trajectory]:
