@@ -1,10 +1,10 @@
 """Does the spread of an ensemble tell where a learned simulator is wrong?
 
-    python benchmarks/ensemble.py --members runs/lite2/model --data data/test --cache runs/ensemble
+    python benchmarks/ensemble.py --members runs/lite2/model --data data/test
 
-Scenes: unseen layouts whose reference trajectories are in --data, and flows out of the model's depth
-(`beyond`), which the reference solver simulates here (35 CPU seconds each). Everything is rolled out
-once and found again in --cache.
+Scenes: unseen layouts whose reference trajectories are in --data, and flows out of the model's
+depth (`beyond`), which the reference solver simulates here (35 CPU seconds each). Everything is
+rolled out once and found again in --cache.
 """
 
 from __future__ import annotations

@@ -18,10 +18,13 @@ from design.options import (
     Simulator,
     Spacing,
     Weight,
+    names_of,
     objective_of,
+    rounds_of,
     simulator_spec,
 )
 from design.rebuild import report
+from design.trust import trust_lines
 from gns_model import console
 
 if TYPE_CHECKING:
@@ -140,6 +143,34 @@ def optimize(
         Optional[int],  # noqa: UP045
         typer.Option(help="Processes of one thread; default: one a core.", show_default=False),
     ] = None,
+    ensemble: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(
+            help="Further learned models that judge what may be verified: names or checkpoint "
+            "folders, again for each or with commas; none: nobody. Default: those that the model's "
+            "card names.",
+            show_default=False,
+        ),
+    ] = None,
+    refine: Annotated[
+        bool,
+        typer.Option(
+            "--refine",
+            help="Train the model on the verified layouts, then search and verify again.",
+        ),
+    ] = False,
+    refine_rounds: Annotated[int, typer.Option(help="How often, with --refine.")] = 1,
+    refine_minutes: Annotated[
+        float, typer.Option(help="Minutes of training in each round of --refine.")
+    ] = 5.0,
+    refine_data: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(
+            help="Folder of trajectories that --refine mixes in, so that the model does not forget "
+            "them; default: none.",
+            show_default=False,
+        ),
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no table.")] = False,
 ) -> None:
     """Search for a layout of baffles, verify the best on the reference solver, write a report."""
@@ -169,6 +200,10 @@ def optimize(
             resume=resume,
             workers=workers,
             batch=batch,
+            ensemble=names_of(ensemble),
+            refine=rounds_of(refine, refine_rounds),
+            refine_minutes=refine_minutes,
+            refine_data=refine_data,
         )
         folder = out if out is not None else Path("runs") / given.name
         summary = optimise(given, folder, settings, command=console.command(), quiet=quiet)
@@ -217,6 +252,8 @@ def _show(summary: dict[str, Any], folder: Path) -> None:
             highlight=False,
         )
     out.print(summary["verdict_text"], markup=False, highlight=False)
+    for line in trust_lines(summary):
+        out.print(line, markup=False, highlight=False)
     for note in summary["notes"]:
         out.print(f"Note: {note}", markup=False, highlight=False)
     out.print(

@@ -7,6 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+#: Layouts closer than this are the same one [m].
+SAME = 1e-6
+
 
 def distance(a: np.ndarray, b: np.ndarray) -> float:
     """The farthest that a baffle has to move to turn layout `a` into `b` [m]; both (n, D-1).
@@ -36,3 +39,8 @@ def apart(
         if all(distance(layout, other) >= least for other in (*avoid, *chosen)):
             chosen.append(layout)
     return chosen
+
+
+def among(layout: np.ndarray, layouts: Sequence[np.ndarray]) -> bool:
+    """Whether `layout` is one of `layouts`, but for round-off."""
+    return any(distance(layout, other) < SAME for other in layouts)

@@ -27,6 +27,9 @@ from gns_model.scene import Scene
 #: `--ensemble none`: no members, whatever the card says.
 NONE = "none"
 
+#: Layouts that the ensemble rolls out for each one that the reference solver then verifies.
+POOL = 2
+
 
 @dataclass(frozen=True)
 class Ensemble:
@@ -112,9 +115,7 @@ def _own_members(simulator: SimulatorSpec, card: dict[str, Any]) -> list[str]:
     return names
 
 
-def relative_spread(
-    outcomes: Sequence[Outcome], none: Sequence[Outcome]
-) -> dict[str, float]:
+def relative_spread(outcomes: Sequence[Outcome], none: Sequence[Outcome]) -> dict[str, float]:
     """How far the members of an ensemble differ over one layout, by measure.
 
     Every member's value is taken relative to what that member says of no baffles: a bias common to
@@ -168,6 +169,18 @@ class Panel:
         self._bare = {spec: roll(spec, None) for spec in ensemble.members}
         watch.add("ensemble: no baffles", [p for ps in self._bare.values() for p in ps])
 
+    def choose(self, layouts: Sequence[Judged], count: int) -> list[Judged]:
+        """The `count` of `layouts` that all members together think best, all of them judged.
+
+        The best by the searcher's own cost stays among them: it is what the search was for.
+        """
+        if not layouts:
+            return []
+        self.judge(layouts)
+        first, *others = layouts
+        others.sort(key=lambda j: j.ensemble_cost if j.ensemble_cost is not None else math.inf)
+        return [first, *others[: count - 1]]
+
     def judge(self, layouts: Sequence[Judged]) -> None:
         """Fill in the spread, the marks and the mean cost of `layouts`."""
         others = [s for s in self.ensemble.members if s != self._searcher]
@@ -185,14 +198,13 @@ class Panel:
                 known = Outcome(layout.cost or 0.0, layout.surrogate)
                 outcomes[self._searcher] = known
             seen = list(outcomes)
-            layout.spread = relative_spread(
-                [outcomes[s] for s in seen], [none[s] for s in seen]
-            )
+            layout.spread = relative_spread([outcomes[s] for s in seen], [none[s] for s in seen])
             layout.ensemble_cost = float(np.mean([o.cost for o in outcomes.values()]))
             layout.marks = self.ensemble.marks(layout.spread)
 
 
-def depth_marks(simulator: SimulatorSpec, scene: Scene) -> list[str]:
+def beyond_limits(simulator: SimulatorSpec, scene: Scene) -> list[str]:
     """What of a scene with its baffles lies outside what a learned model was trained on."""
     config = getattr(simulator.load(), "config", None)
-    return [] if config is None else [f"not trained for: {x}" for x in config.limits.broken_by(scene)]
+    lines = [] if config is None else config.limits.broken_by(scene)
+    return [f"the model was not trained for {line}" for line in lines]

@@ -24,16 +24,19 @@ from design.verify import Judged
 from gns_model.errors import FileFormatError
 from gns_model.learned.checkpoint import CARD, load_model, read_card, save_model
 from gns_model.learned.config import Limits
-from gns_model.scene import Scene, write_whole
+from gns_model.scene import Scene
 from gns_model.training import TrainingError, launch
 from gns_model.training.recipe import Recipe
 from gns_model.training.state import FILE, read_position
+from gns_model.trajectory import open_trajectory
 
 if TYPE_CHECKING:
     from design.run import Run
 
 #: Steps of the model that a training rollout is unrolled over at most.
 UNROLL = 10
+
+LEARNING_RATE = 3e-4
 
 
 @dataclass(frozen=True)
@@ -94,11 +97,116 @@ def teach(run: Run, lesson: Lesson, store: RolloutStore, watch: Watch) -> Simula
     if lesson.done:
         return lesson.model
     scenes = _lay_out(run, lesson, store, watch)
-    recipe = recipe_of(run, lesson, scenes)
-    lesson.training.mkdir(parents=True, exist_ok=True)
-    file = lesson.training / "recipe.toml.json"
-    write_whole(file, recipe.model_dump_json(indent=2).encode())
-    _train(file, recipe, lesson, run.workers, watch)
+    s = run.settings
+    recipe = recipe_of(lesson, scenes, minutes=s.refine_minutes, data=s.refine_data)
+    _train(recipe, lesson, run.workers, watch)
     _keep(lesson, scenes)
     shutil.rmtree(lesson.folder / "lessons", ignore_errors=True)
     return lesson.model
+
+
+def recipe_of(
+    lesson: Lesson, scenes: Sequence[Scene], *, minutes: float, data: Path | None
+) -> Recipe:
+    """How `lesson` is trained.
+
+    Raises:
+        FileFormatError: if there are no trajectories in `data`.
+    """
+    config = lesson.start.load().config  # type: ignore[attr-defined]
+    steps = min(round(s.duration / config.dt) for s in scenes)
+    lessons = str(lesson.folder / "lessons")
+    train = [lessons]
+    if data is not None:
+        old = len(list(data.glob("*.h5")))
+        if old == 0:
+            raise FileFormatError(f"{data}: no trajectory files (*.h5) in this folder")
+        # Trajectories are drawn uniformly: half of the windows shall come from the new ones.
+        train = [lessons] * max(1, round(old / len(scenes))) + [str(data)]
+    return Recipe(
+        name=f"{Path(lesson.start.name).name}, refined",
+        start_from=lesson.start.name,
+        model=config,
+        train=tuple(train),
+        minutes=minutes,
+        edges_per_batch=60_000,
+        learning_rate=LEARNING_RATE,
+        warmup=0.05,
+        ema_decay=0.98,
+        linear_beyond=3.0,
+        momentum_weight=10.0,
+        early=0.5,
+        early_steps=max(1, min(24, steps // 2)),
+        unroll=max(1, min(UNROLL, steps // 2)),
+        unroll_fraction=1.0,
+        return_steps=8.0,
+        statistics_windows=32,  # the model keeps those it was trained with
+        device="cpu" if lesson.start.device == "cpu" else "cuda",
+        precision="bfloat16",
+        checkpoint_minutes=1.0,
+    )
+
+
+def _lay_out(run: Run, lesson: Lesson, store: RolloutStore, watch: Watch) -> list[Scene]:
+    """Link the reference trajectories of the verified layouts into RUN/refined-k/lessons."""
+    verifier = run.settings.verifier
+    pending = [p for j in lesson.judged for p in run.roll(store, verifier, j, trajectory=True)]
+    watch.add(f"{lesson.folder.name}: trajectories", pending)
+    watch.wait(pending)
+    folder = lesson.folder / "lessons"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    scenes = []
+    for k, rolled in enumerate(p.result() for p in pending):
+        if rolled.status != "ok":
+            continue
+        link = folder / f"verified-{k:03d}.h5"
+        try:
+            os.link(rolled.path, link)
+        except OSError:  # a file system without hard links
+            shutil.copyfile(rolled.path, link)
+        with open_trajectory(link) as file:
+            scenes.append(Scene.from_dict(json.loads(file.attrs["scene"]), source=str(link)))
+    return scenes
+
+
+def _train(recipe: Recipe, lesson: Lesson, ranks: int, watch: Watch) -> None:
+    """Run the training in processes of its own; returns when its time is used up."""
+    lesson.training.mkdir(parents=True, exist_ok=True)
+    file, log = lesson.training / "recipe.toml", lesson.training / "log.txt"
+    recipe.to_toml(file)
+    budget = 60 * (recipe.minutes or 0)
+    state = lesson.training / FILE
+    before = read_position(state).seconds if state.exists() else 0.0
+    began = time.monotonic()
+    task = watch.bar.add_task(f"{lesson.folder.name}: training", total=budget)
+
+    def show() -> None:
+        watch.bar.update(task, completed=min(budget, before + time.monotonic() - began))
+
+    code = launch(file, lesson.training, ranks, log=log, watch=show)
+    if code != 0:
+        lines = log.read_text(errors="replace").strip().splitlines() or [f"exit code {code}"]
+        raise TrainingError(f"{lesson.training}: {lines[-1].removeprefix('error: ')}")
+    if not state.exists() or read_position(state).seconds < budget:
+        raise KeyboardInterrupt  # it was told to stop, and has saved its state
+    watch.bar.update(task, completed=budget)
+
+
+def _keep(lesson: Lesson, scenes: Sequence[Scene]) -> None:
+    """Write the refined model and its card into the folder of the round."""
+    trained = load_model(lesson.training / "last")
+    parent = lesson.start.load()
+    limits: Limits = parent.config.limits.widened(scenes)  # type: ignore[attr-defined]
+    trained.model.config = trained.model.config.model_copy(update={"limits": limits})
+    about = {
+        "from": lesson.start.describe(),
+        "layouts": [np.round(c, 6).tolist() for c in lesson.layouts],
+        "scene": scenes[0].name,
+    }
+    card = {
+        "name": lesson.folder.name,
+        "refined": about,
+        "trained_on": trained.card["trained_on"],
+    }
+    save_model(lesson.folder, trained.model, card)

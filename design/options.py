@@ -61,3 +61,32 @@ def objective_of(**weights: float | None) -> Objective:
 
     given: dict[str, Any] = {name: value for name, value in weights.items() if value is not None}
     return Objective(**given)
+
+
+def names_of(given: list[str] | None) -> tuple[str, ...] | None:
+    """Names that were given one by one or with commas; None if none were.
+
+    Raises:
+        SettingError: for an empty name.
+    """
+    from design.settings import SettingError
+
+    if given is None:
+        return None
+    names = tuple(name.strip() for text in given for name in text.split(","))
+    if not all(names):
+        raise SettingError("--ensemble: give names or folders of learned models, or none")
+    return names
+
+
+def rounds_of(refine: bool, rounds: int) -> int:
+    """How many rounds of refinement are asked for.
+
+    Raises:
+        SettingError: for less than one.
+    """
+    from design.settings import SettingError
+
+    if rounds < 1:
+        raise SettingError(f"--refine-rounds must be 1 or more, got {rounds}")
+    return rounds if refine else 0

@@ -13,8 +13,6 @@ for those that the refined model found afterwards: only the second says whether 
 
 from __future__ import annotations
 
-import math
-import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from design.distinct import distance
+from design.distinct import among
 from design.ensemble import Ensemble, is_learned
 from design.evaluators import SimulatorSpec
 from design.lessons import Lesson, teach
@@ -34,9 +32,6 @@ from gns_model.errors import SimulatorError
 if TYPE_CHECKING:
     from design.run import Run
     from design.workers import Workers
-
-#: Layouts closer than this [m] are the same one.
-SAME = 1e-6
 
 
 @dataclass(frozen=True)
@@ -114,12 +109,12 @@ def refine(run: Run, store: RolloutStore, workers: Workers, watch: Watch) -> Non
         inner.judge(store, workers, watch)
         inner.write(COMPLETE)
         inner.log.close()
-        found = [j for j in inner.ranked if not _among(j.centres, known)]
+        found = [j for j in inner.ranked if not among(j.centres, [k.centres for k in known])]
         for judged in found:
             judged.model = folder.name
         run.models[folder.name] = refined
         run.rounds.append(_told(run, inner, lesson, known, found, store, watch))
-        run.reference_rollouts += inner.verified_rollouts
+        run.reference_rollouts += inner.candidate_rollouts
         run.ranked = rank([*run.ranked, *found])
         known += found
         spec = refined
@@ -136,7 +131,7 @@ def _told(
     watch: Watch,
 ) -> dict[str, Any]:
     """What summary.json says of a round."""
-    taught = [j for j in known if j.verified is not None and _among(j.centres, lesson.layouts)]
+    taught = [j for j in known if j.verified is not None and among(j.centres, lesson.layouts)]
     new = [j for j in found if j.verified is not None]
     before, after = lesson.start, inner.settings.simulator
     by = {
@@ -162,7 +157,7 @@ def _told(
         "best_found": min(costs, default=None),
         "rollouts": inner.summary["rollouts"],
         "backwards": inner.summary["backwards"],
-        "reference_rollouts": inner.verified_rollouts,
+        "reference_rollouts": inner.candidate_rollouts,
     }
 
 
@@ -180,13 +175,3 @@ def _seen_by(
         outcome = run.weigh([p.result() for p in jobs], none)
         if outcome.status == "ok":
             yield replace(j, surrogate=dict(outcome.measures), cost=outcome.cost)
-
-
-def _among(centres: np.ndarray, layouts: Sequence[Judged | np.ndarray]) -> bool:
-    others = (x.centres if isinstance(x, Judged) else x for x in layouts)
-    return any(math.isfinite(d) and d < SAME for d in (distance(centres, o) for o in others))
-
-
-def tidy(folder: Path) -> None:
-    """Delete the trajectories that a round was taught, hundreds of megabytes."""
-    shutil.rmtree(folder / "lessons", ignore_errors=True)

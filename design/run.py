@@ -9,6 +9,7 @@
     trajectories/      {best,paper,none}-{mpm,learned}.h5: by the reference solver and by the
                        simulator that searched
     rollouts/          what a rerun with --resume finds again
+    refined-1/, ...    with --refine: the refined model and the search with it, see refine.py
     figures/, flow.gif, report.html
 
 The reference solver starts on the scene without baffles and on its own layout while the search
@@ -31,8 +32,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from design import refine
 from design.blame import room_for
 from design.campaign import Campaign, Evaluator
+from design.distinct import among
+from design.ensemble import POOL, Ensemble, Panel, beyond_limits
 from design.evaluators import InProcess, InWorkers, SimulatorSpec, TaskSpec, failure_cost
 from design.evaluators import differentiable as has_gradient
 from design.front import front_entries, relative, write_front
@@ -63,6 +67,8 @@ from gns_model.scene import Scene
 
 if TYPE_CHECKING:
     from rich.progress import Progress
+
+    from design.refine import Continued
 
 
 def optimise(
@@ -107,12 +113,21 @@ class Run:
 
     Attributes:
         ranked: the layouts found, best first, verified once they are.
+        ensemble: who says where the simulator is out of its depth; empty for nobody.
+        models: the simulators that searched, by the name of their round; "" is the one given.
+        rounds: what each round of refinement gave, as summary.json has it.
         paper, none: the scene's own layout, if it has one, and no baffles.
         seconds: spent on each stage.
     """
 
     def __init__(
-        self, scene: Scene, out: Path, settings: Settings, command: Sequence[str] = ()
+        self,
+        scene: Scene,
+        out: Path,
+        settings: Settings,
+        command: Sequence[str] = (),
+        *,
+        continued: Continued | None = None,
     ) -> None:
         self._began = time.perf_counter()
         self.scene, self.out, self.settings, self.command = scene, out, settings, list(command)
@@ -121,7 +136,10 @@ class Run:
         self.none: Judged | None = None
         self.seconds: dict[str, float] = {}
         self.summary: dict[str, Any] = {}
-        self.reference_rollouts = 0
+        self.reference_rollouts = self.candidate_rollouts = 0
+        self.continued = continued
+        self.rounds: list[dict[str, Any]] = []
+        self.models = {"": settings.simulator}
         self.baffles = settings.baffles or len(scene.baffles) or 3
         self.drawn: list[Scenario] = []
         self.notes: list[str] = []
@@ -149,6 +167,11 @@ class Run:
             settings.simulator.name,
         )
         of_use = max(settings.batch, settings.verify + 2)
+        self.ensemble = (
+            continued.ensemble if continued else Ensemble.of(settings.simulator, settings.ensemble)
+        )
+        if settings.refine:
+            refine.check(self)
         self.workers = settings.workers or max(1, min(default_count(), of_use))
         self.storage = settings.storage or sqlite_url(out / "study.db")
         self._log: TrialLog | None = None
@@ -201,26 +224,42 @@ class Run:
 
     def simulate(self, workers: Workers, bar: Progress) -> None:
         """Everything up to the numbers: search, verification, trajectories."""
-        store = RolloutStore(self.out, workers)
+        store, watch = RolloutStore(self.out, workers), Watch(bar)
+        searched, verified = self.judge(store, workers, watch)
+        if self.settings.refine:
+            refine.refine(self, store, workers, watch)
+        with self.timed("trajectories"):
+            self._name_trajectories(store, searched, verified)
+        self.write(COMPLETE)
+
+    def judge(
+        self, store: RolloutStore, workers: Workers, watch: Watch
+    ) -> tuple[dict[str, list[Pending]], dict[str, list[Pending]]]:
+        """Search and verify.
+
+        Returns:
+            rollouts of no baffles and of the scene's own layout, by the simulator that searched and
+            by the reference solver.
+        """
         s = self.settings
         searched = self._references(store, s.simulator)
         verified = self._references(store, s.verifier) if s.verify else {}
-        watch = Watch(bar)
         watch.add("search: no baffles, own layout", [p for ps in searched.values() for p in ps])
         watch.add("verify: no baffles, own layout", [p for ps in verified.values() for p in ps])
 
-        with self._timed("search"):
+        panel = self._panel(store, watch) if self.ensemble and s.verify else None
+
+        with self.timed("search"):
             references = self._take_in(searched, watch)
             self._search(workers, references, watch)
         self.write(PARTIAL)
-        with self._timed("verify"):
+        with self.timed("verify"):
             if s.verify:
-                self._verify(store, verified, watch)
+                self._verify(store, verified, panel, watch)
             else:
                 self.ranked = rank(self._candidates(1))
-        with self._timed("trajectories"):
-            self._name_trajectories(store, searched, verified)
-        self.write(COMPLETE)
+        self.write(PARTIAL)
+        return searched, verified
 
     def publish(self, bar: Progress) -> None:
         """Geometry, figures and report, from what stands in the run folder."""
@@ -228,7 +267,7 @@ class Run:
         from design.report import write_report
 
         task = bar.add_task("report", total=1)
-        with self._timed("report"):
+        with self.timed("report"):
             if self.ranked:
                 best = self.bare.with_baffles(self.ranked[0].centres)
                 write_geometry(best, self.out / "layouts", "best")
@@ -245,6 +284,8 @@ class Run:
             "status": status,
             **results(ranked, self.paper, self.none, trials, s.objective),
             **self._several(trials),
+            **({"ensemble": self.ensemble.describe()} if self.ensemble else {}),
+            **({"refined": self.rounds} if s.refine else {}),
             "reference_rollouts": self.reference_rollouts,
             "seconds": {k: round(v, 2) for k, v in {**self.seconds, "total": total}.items()},
             "notes": self.notes,
@@ -263,6 +304,7 @@ class Run:
                 "objective": {**asdict(s.objective), "text": str(s.objective)},
                 **({"objectives": ",".join(s.objectives)} if s.objectives else {}),
                 **({"scenarios": _described(s.scenarios)} if s.scenarios else {}),
+                **_trusted(s),
                 "storage": self.storage.rsplit("@", 1)[-1],
             },
             "versions": versions(),
@@ -315,11 +357,37 @@ class Run:
         """
         return flow.replace(baffles=self.scene.baffles)
 
+    def roll(
+        self,
+        store: RolloutStore,
+        spec: SimulatorSpec,
+        layout: Judged | None,
+        *,
+        trajectory: bool = False,
+    ) -> list[Pending]:
+        """Start the rollouts of a layout (None: no baffles) by `spec`, one in each flow."""
+        if layout is None or layout.origin == "none":
+            flows = self.flows
+        elif layout.origin == "scene":
+            flows = [self._own(flow) for flow in self.flows]
+        else:
+            flows = [flow.with_baffles(layout.centres) for flow in self.flows]
+        return [store.start(spec, flow, trajectory=trajectory) for flow in flows]
+
+    def _panel(self, store: RolloutStore, watch: Watch) -> Panel:
+        return Panel(
+            self.ensemble,
+            self.settings.simulator,
+            lambda spec, layout: self.roll(store, spec, layout),
+            self.weigh,
+            watch,
+        )
+
     def _note(self, line: str) -> None:
         if line not in self.notes:
             self.notes.append(line)
 
-    def _weigh(self, rolled: Sequence[Rolled], none: Sequence[Rolled]) -> Outcome:
+    def weigh(self, rolled: Sequence[Rolled], none: Sequence[Rolled]) -> Outcome:
         """One layout in all flows, relative to no baffles in each."""
         s = self.settings
         flows = [
@@ -339,12 +407,12 @@ class Run:
                     f"{rolled.status!r}, so no cost can be relative to it"
                 )
         empty = np.zeros((0, self.scene.dim - 1))
-        self.none = as_judged(Trial(-1, "none", empty, self._weigh(none, none)))
+        self.none = as_judged(Trial(-1, "none", empty, self.weigh(none, none)))
         if "paper" in searched:
             own = [p.result() for p in searched["paper"]]
             centres = np.array([baffle.center for baffle in self.scene.baffles], dtype=float)
             seconds = sum(r.seconds for r in own)
-            outcome = replace(self._weigh(own, none), seconds=seconds)
+            outcome = replace(self.weigh(own, none), seconds=seconds)
             self.paper = as_judged(Trial(-1, "scene", centres, outcome))
             self._log_own_layout(centres, outcome)
         return none
@@ -376,18 +444,21 @@ class Run:
                 bar.update(task, description=f"{title}, {said}")
             bar.advance(task, trial.outcome.rollouts + trial.outcome.backwards)
 
-        METHODS[self.method](
-            Campaign(
-                log=log,
-                evaluator=self._evaluator(workers, [r.path for r in references], watch),
-                budget=s.passes,
-                seed=s.seed,
-                batch=s.batch,
-                on_trial=on_trial,
-                salt=_salt() if s.storage else 0,
-                price=s.flows,
-            )
+        campaign = Campaign(
+            log=log,
+            evaluator=self._evaluator(workers, [r.path for r in references], watch),
+            budget=s.passes,
+            seed=s.seed,
+            batch=s.batch,
+            on_trial=on_trial,
+            salt=_salt() if s.storage else 0,
+            price=s.flows,
         )
+        if self.continued:
+            known = [t.centres for t in log.trials()]
+            fresh = [c for c in self.continued.first if not among(c, known)]
+            campaign.run([("verified", c) for c in fresh])
+        METHODS[self.method](campaign)
 
     def _evaluator(self, workers: Workers, references: list[Path], watch: Watch) -> Evaluator:
         s = self.settings
@@ -401,21 +472,26 @@ class Run:
             return [as_judged(t) for t in spread(front(self.log.trials()), count)]
         # Closer than a third of a baffle is one design.
         least = float(min(self.space.size[[0, *range(2, self.scene.dim)]])) / 3
-        own = [] if self.paper is None else [self.paper.centres]
-        return candidates(self.log.trials(), count, least, avoid=own)
+        known = [] if self.paper is None else [self.paper.centres]
+        known += self.continued.avoid if self.continued else []
+        return candidates(self.log.trials(), count, least, avoid=known)
 
     def _verify(
-        self, store: RolloutStore, references: dict[str, list[Pending]], watch: Watch
+        self,
+        store: RolloutStore,
+        references: dict[str, list[Pending]],
+        panel: Panel | None,
+        watch: Watch,
     ) -> None:
         s = self.settings
-        chosen = self._candidates(s.verify)
-        pending = [
-            [
-                store.start(s.verifier, flow.with_baffles(layout.centres), trajectory=False)
-                for flow in self.flows
-            ]
-            for layout in chosen
-        ]
+        if panel is None:
+            chosen = self._candidates(s.verify)
+        else:
+            chosen = panel.choose(self._candidates(POOL * s.verify), s.verify)
+            panel.judge([j for j in (self.paper,) if j is not None])
+        for one in chosen:
+            one.marks += beyond_limits(s.simulator, self.bare.with_baffles(one.centres))
+        pending = [self.roll(store, s.verifier, one) for one in chosen]
         started = [p for ps in pending for p in ps]
         watch.add(f"verify: best {len(chosen)}", started)
         watch.wait([*(p for ps in references.values() for p in ps), *started])
@@ -429,7 +505,8 @@ class Run:
         judged = [(self.none, references["none"]), (self.paper, references.get("paper"))]
         for layout, jobs in (*judged, *zip(chosen, pending, strict=True)):
             if layout is not None and jobs is not None:
-                layout.take(self._weigh([job.result() for job in jobs], none))
+                layout.take(self.weigh([job.result() for job in jobs], none))
+        self.candidate_rollouts = len(started)
         self.reference_rollouts = len(started) + sum(map(len, references.values()))
         self.ranked = rank(chosen)
 
@@ -455,7 +532,9 @@ class Run:
                     shown["paper"] = store.start(spec, self._own(self.bare))
             if self.ranked:
                 best = self.bare.with_baffles(self.ranked[0].centres)
-                shown["best"] = store.start(spec, best)
+                # Whoever found it: a refined model knows more than the one that was given.
+                who = self.models[self.ranked[0].model] if role == "learned" else spec
+                shown["best"] = store.start(who, best)
             for key, job in shown.items():
                 rolled = job.result()
                 store.name(rolled, f"{key}-{role}")
@@ -463,7 +542,8 @@ class Run:
         store.prune(named)
 
     @contextlib.contextmanager
-    def _timed(self, stage: str) -> Iterator[None]:
+    def timed(self, stage: str) -> Iterator[None]:
+        """Write down what a stage takes."""
         started = time.perf_counter()
         try:
             yield
@@ -496,6 +576,18 @@ def _described(scenarios: Scenarios) -> dict[str, Any]:
         "risk": scenarios.risk.kind,
         **({"level": scenarios.risk.level} if scenarios.risk.kind == "cvar" else {}),
     }
+
+
+def _trusted(settings: Settings) -> dict[str, Any]:
+    """The options of ensemble and refinement, as words for the same command."""
+    s = settings
+    values: dict[str, Any] = {}
+    if s.ensemble is not None:
+        values["ensemble"] = ",".join(s.ensemble)
+    if s.refine:
+        values |= {"refine": s.refine, "refine_minutes": s.refine_minutes}
+        values |= {"refine_data": str(s.refine_data)} if s.refine_data else {}
+    return values
 
 
 def _salt() -> int:

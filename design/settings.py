@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from design.evaluators import SimulatorSpec
 from design.methods import METHODS
@@ -39,6 +41,11 @@ class Settings:
         resume: go on with what the run folder and the storage hold.
         workers: processes of one thread; None: one a core, as many as are of use.
         batch: layouts proposed at a time.
+        ensemble: further learned models that judge what may be verified; None: those that the card
+            of the simulator names.
+        refine: rounds in which verified layouts are fed back into training.
+        refine_minutes: of training in each round.
+        refine_data: folder of trajectories that the model must not forget, if any.
 
     Raises:
         SettingError: for a value out of its range.
@@ -58,9 +65,14 @@ class Settings:
     resume: bool = False
     workers: int | None = None
     batch: int = 8
+    ensemble: tuple[str, ...] | None = None
+    refine: int = 0
+    refine_minutes: float = 5.0
+    refine_data: Path | None = None
 
     def __post_init__(self) -> None:
         least = {"budget": 1, "verify": 0, "batch": 1, "seed": 0, "workers": 1, "baffles": 1}
+        least["refine"] = 0
         for name, bound in least.items():
             value = getattr(self, name)
             if value is not None and value < bound:
@@ -70,6 +82,10 @@ class Settings:
                 f"budget must be {self.flows} or more, a rollout for each scenario, got "
                 f"{self.budget}"
             )
+        if self.refine and not self.verify:
+            raise SettingError("refine needs verified layouts: verify must be 1 or more, got 0")
+        if not (math.isfinite(self.refine_minutes) and self.refine_minutes > 0):
+            raise SettingError(f"refine_minutes must be positive, got {self.refine_minutes:g}")
         if self.objectives:
             object.__setattr__(self, "objective", joined(self.parts))
         if self.method is not None and self.method not in METHODS:

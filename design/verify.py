@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,10 @@ class Judged:
         cost, verified_cost: the objective by each, relative to its own rollout without baffles.
         costs, verified_costs: the same by objective, of a search with several.
         flows, verified_flows: the same by scenario, of a robust search.
+        spread: of an ensemble's members over this layout, by measure; see `ensemble`.
+        ensemble_cost: mean of the costs that they give it.
+        marks: why the simulator that searched may be out of its depth here, in words.
+        model: the refined model that found it, "refined-1" and so on; "": the one that was given.
     """
 
     origin: str
@@ -42,6 +46,10 @@ class Judged:
     verified_costs: tuple[float, ...] = ()
     flows: tuple[float, ...] = ()
     verified_flows: tuple[float, ...] = ()
+    spread: dict[str, float] = field(default_factory=dict)
+    ensemble_cost: float | None = None
+    marks: list[str] = field(default_factory=list)
+    model: str = ""
 
     def take(self, outcome: Outcome) -> None:
         """Take in what the reference solver says of all flows."""
@@ -52,11 +60,17 @@ class Judged:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for summary.json."""
-        several = {
+        several: dict[str, Any] = {
             name: list(getattr(self, name))
-            for name in ("costs", "verified_costs", "flows", "verified_flows")
+            for name in ("costs", "verified_costs", "flows", "verified_flows", "marks")
             if getattr(self, name)
         }
+        if self.spread:
+            # What failed in one member has no spread, and infinity is not JSON.
+            known = {k: v for k, v in self.spread.items() if math.isfinite(v)}
+            several |= {"spread": known, "ensemble_cost": self.ensemble_cost}
+        if self.model:
+            several["model"] = self.model
         return {
             "layout": np.round(self.centres, 6).tolist(),
             "origin": self.origin,

@@ -547,7 +547,7 @@ class Scene(_Part):
 
     def to_toml(self, path: str | os.PathLike[str] | None = None) -> str:
         """The scene as TOML text; also written to `path`, whole or not at all, if one is given."""
-        text = _to_toml(self.to_dict())
+        text = toml_text(self.to_dict())
         if path is not None:
             write_whole(Path(path), text.encode())
         return text
@@ -628,7 +628,8 @@ def first_fault(
     return f"{key} = {fault['input']!r}: {message}"
 
 
-def _to_toml(values: dict[str, Any]) -> str:
+def toml_text(values: dict[str, Any]) -> str:
+    """Plain values as TOML: keys first, then tables and lists of tables, one level deep."""
     lines: list[str] = []
     tables: list[str] = []
     for key, value in values.items():

@@ -50,6 +50,20 @@ class Limits(BaseModel):
                 limits[name] = max(values) if single else (min(values), max(values))
         return cls.model_validate(limits)
 
+    def widened(self, scenes: Iterable[Scene]) -> Limits:
+        """These limits, as far as there are any, and what else holds `scenes`."""
+        seen = Limits.of(scenes)
+        wider: dict[str, float | Range | None] = {}
+        for name in type(self).model_fields:
+            mine, other = getattr(self, name), getattr(seen, name)
+            if mine is None or other is None:
+                wider[name] = mine
+            elif isinstance(mine, tuple):
+                wider[name] = min(mine[0], other[0]), max(mine[1], other[1])
+            else:
+                wider[name] = max(mine, other)
+        return Limits.model_validate(wider)
+
     def broken_by(self, scene: Scene) -> list[str]:
         """One line for every limit that `scene` lies outside of, naming it, value and range."""
         lines = []

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch.distributed as dist
@@ -29,6 +29,8 @@ def launch(
     resume: bool = True,
     threads: int = 1,
     arguments: Sequence[str] = (),
+    log: str | os.PathLike[str] | None = None,
+    watch: Callable[[], None] | None = None,
 ) -> int:
     """Train on `ranks` local processes and wait for them.
 
@@ -42,6 +44,8 @@ def launch(
         resume: go on from the state in `out`, if there is one.
         threads: of every rank.
         arguments: further arguments of `python -m gns_model.training`.
+        log: file that takes what the ranks would print.
+        watch: called ten times a second.
 
     Returns:
         0, or the exit code of the first rank that failed.
@@ -53,6 +57,7 @@ def launch(
     command += ["--resume" if resume else "--no-resume", *arguments]
     root = str(Path(__file__).resolve().parents[2])
     processes = []
+    printed = open(log, "ab") if log is not None else None  # noqa: SIM115  (closed below)
     for rank in range(ranks):
         environment = dict(
             os.environ,
@@ -69,7 +74,17 @@ def launch(
         )
         environment[LAUNCHER] = str(os.getpid())
         # Its own process group, so that Ctrl-C reaches a rank once: from here.
-        processes.append(subprocess.Popen(command, env=environment, start_new_session=True))
+        processes.append(
+            subprocess.Popen(
+                command,
+                env=environment,
+                start_new_session=True,
+                stdout=printed,
+                stderr=printed and subprocess.STDOUT,
+            )
+        )
+    if printed is not None:
+        printed.close()  # the ranks have their own ends of it
 
     def pass_on(number: int, _frame: object) -> None:
         for process in processes:
@@ -91,6 +106,8 @@ def launch(
                 return failed[0]
             if all(code == 0 for code in codes):
                 return 0
+            if watch is not None:
+                watch()
             time.sleep(0.1)
     finally:
         for number, handler in before.items():

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from gns_model.errors import GnsError
 from gns_model.learned.config import ModelConfig
 from gns_model.particles import MOVING
-from gns_model.scene import first_fault
+from gns_model.scene import first_fault, toml_text, write_whole
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -117,6 +117,12 @@ class Recipe(BaseModel):
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise RecipeError(f"{path}: not a TOML file ({error})") from None
         return cls.from_dict(values, source=str(path))
+
+    def to_toml(self, path: str | os.PathLike[str]) -> None:
+        """Write the recipe, as `from_toml` reads it; the limits, which training fills in, are not
+        a part of it."""
+        values = self.model_dump(mode="json", exclude_none=True, exclude={"model": {"limits"}})
+        write_whole(Path(path), toml_text(values).encode())
 
     @classmethod
     def from_dict(cls, values: dict[str, Any], source: str = "recipe") -> Recipe:
