@@ -106,7 +106,9 @@ def refine(run: Run, store: RolloutStore, workers: Workers, watch: Watch) -> Non
             ),
         )
         inner.open()
-        inner.judge(store, workers, watch)
+        searched, _ = inner.judge(store, workers, watch)
+        # A resumed round reads what its search is relative to.
+        run.kept |= {p.result().path for pending in searched.values() for p in pending}
         inner.write(COMPLETE)
         inner.log.close()
         found = [j for j in inner.ranked if not among(j.centres, [k.centres for k in known])]
@@ -143,7 +145,7 @@ def _told(
     costs = [c for c in (j.verified_cost for j in new) if c is not None]
     return {
         "model": lesson.folder.name,
-        "from": before.name,
+        "from": Path(before.name).name,
         **lesson.spent(),
         **{
             part: {

@@ -116,6 +116,7 @@ class Run:
         ensemble: who says where the simulator is out of its depth; empty for nobody.
         models: the simulators that searched, by the name of their round; "" is the one given.
         rounds: what each round of refinement gave, as summary.json has it.
+        kept: trajectories that are not deleted in the end, though nobody looks at them.
         paper, none: the scene's own layout, if it has one, and no baffles.
         seconds: spent on each stage.
     """
@@ -140,6 +141,7 @@ class Run:
         self.continued = continued
         self.rounds: list[dict[str, Any]] = []
         self.models = {"": settings.simulator}
+        self.kept: set[Path] = set()
         self.baffles = settings.baffles or len(scene.baffles) or 3
         self.drawn: list[Scenario] = []
         self.notes: list[str] = []
@@ -519,6 +521,7 @@ class Run:
         """Name what a reader looks at: the scene's own flow, also of a robust design."""
         s = self.settings
         named = {p.result().path for p in searched["none"]}  # a resumed search reads them
+        named |= self.kept
         for role, spec, known in (
             ("learned", s.simulator, searched),
             ("mpm", s.verifier, verified),
