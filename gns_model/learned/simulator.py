@@ -131,7 +131,10 @@ class LearnedSimulator:
         """
         points = fill(scene, self.config.spacing)
         if self.config.subcells > 1:
-            usual, other = (scatter(points, self.config.subcells, d).positions for d in (0, draw))
+            usual, other = (
+                scatter(points, self.config.subcells, d).positions
+                for d in (self.filling, self.filling + draw)
+            )
             shift = other - usual
         else:
             most = PERTURBATION * self.config.spacing if draw else 0.0
