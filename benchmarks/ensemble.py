@@ -11,17 +11,24 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from rich.progress import Progress
 
+from design.ensemble import Ensemble, beyond_limits, relative_spread
 from design.evaluators import SimulatorSpec
 from design.store import Rolled, RolloutStore, Watch
+from design.trials import Outcome
+from design.verify import spearman
 from design.workers import Workers
+from gns_env.objective import Objective
 from gns_model import measures
-from gns_model.console import progress_bar
-from gns_model.scene import Scene
+from gns_model.console import print_table, progress_bar
+from gns_model.learned.checkpoint import CARD, read_card
+from gns_model.scene import Scene, write_whole
 from gns_model.trajectory import Trajectory
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -31,7 +38,11 @@ parser.add_argument("--fillings", type=int, default=0, help="further fillings of
 parser.add_argument("--data", type=Path, required=True, help="folder of unseen layouts")
 parser.add_argument("--layouts", type=int, default=32, help="how many of them")
 parser.add_argument("--cache", type=Path, default=Path("runs/ensemble"))
+parser.add_argument("--write", type=Path, help="checkpoint whose card shall name this ensemble")
 parser.add_argument("--workers", type=int, default=1)
+
+UNSEEN = "unseen layouts"
+MEASURES = ("cost", "centroid_travel", "upstream_depth", "runout_p99", "mass_past_section")
 
 
 @dataclass
@@ -44,6 +55,7 @@ class Case:
     true_none: dict[str, float]
     members: list[Rolled]
     members_none: list[Rolled]
+    broken: list[str]
 
 
 def beyond() -> dict[str, Scene]:
@@ -78,24 +90,141 @@ def beyond() -> dict[str, Scene]:
         "gaps of 5 cm": changed("slits", baffle=boxes(lattice, [0.15, 0.3, 0.15])),
         "posts of 4 cm": changed("posts", baffle=boxes(row, [0.04, 0.3, 0.04])),
         "wall of 1 m": changed("wall", baffle=boxes([(0.75, 1.0)], [0.15, 0.6, 1.0])),
-        "release 0.45 m high": changed(
-            "tall", release=[{**values["release"][0], "upper": [0.45, 0.55, 1.7]}]
-        ),
     }
 
 
 def main() -> None:
     arguments = parser.parse_args()
-    model = SimulatorSpec(arguments.model)
-    specs = [model, *map(SimulatorSpec, arguments.members)]
+    ensemble = Ensemble.of(SimulatorSpec(arguments.model), arguments.members or None)
+    specs = list(ensemble.members) or [SimulatorSpec(arguments.model)]
     specs += [
         SimulatorSpec(arguments.model, options=(("filling", k),))
         for k in range(1, arguments.fillings + 1)
     ]
+    if len(specs) < 2:
+        raise SystemExit("nothing to compare: the card names no members, so give --members")
     with Workers(arguments.workers) as workers, progress_bar() as bar:
         store = RolloutStore(arguments.cache, workers)
-        scenes = collect(arguments, store, specs, bar)
-    print(len(scenes))
+        cases = collect(arguments, store, specs, bar)
+    print("Simulators: " + ", ".join(f"{s.name} {dict(s.options) or ''}".strip() for s in specs))
+    judged = [Judgement.of(case) for case in cases]
+    unseen = [j for j in judged if j.name == UNSEEN]
+    limits = {m: max(j.spread[m] for j in unseen) for m in MEASURES}
+    print_cases(judged, limits)
+    print_correlations(judged, limits)
+    print("Limits: the largest spread over the unseen layouts, " + json.dumps(limits))
+    if arguments.write is not None:
+        write(arguments.write, [s.name for s in specs[1:]], limits)
+
+
+def print_cases(judged: Sequence[Judgement], limits: dict[str, float]) -> None:
+    """A row for the unseen layouts together and for each flow beyond them."""
+    rows = []
+    groups = [(UNSEEN, [j for j in judged if j.name == UNSEEN])]
+    groups += [(j.name, [j]) for j in judged if j.name != UNSEEN]
+    for name, group in groups:
+        marked = sum(j.marked(limits) for j in group)
+        row = [f"{name} ({len(group)})" if len(group) > 1 else name]
+        for m in MEASURES:
+            spread, error = (
+                np.mean([getattr(j, k)[m] for j in group]) for k in ("spread", "error")
+            )
+            row.append(f"{100 * spread:.1f} / {100 * error:.1f}")
+        row.append(f"{marked} of {len(group)}")
+        row.append("; ".join(sorted({line.split(" = ")[0] for j in group for line in j.broken})))
+        rows.append(row)
+    print_table(
+        "Spread / error in %, of values relative to no baffles",
+        ["scene", *MEASURES, "marked", "limits of the card"],
+        rows,
+    )
+
+
+def print_correlations(judged: Sequence[Judgement], limits: dict[str, float]) -> None:
+    """Does a layout of larger spread have the larger error?"""
+    rows = []
+    for name, chosen in (
+        ("unseen layouts", [j for j in judged if j.name == UNSEEN]),
+        ("flows beyond", [j for j in judged if j.name != UNSEEN]),
+        ("all", list(judged)),
+    ):
+        cells = []
+        for m in MEASURES:
+            spread = np.array([j.spread[m] for j in chosen])
+            rank = spearman(spread, np.array([j.error[m] for j in chosen]))
+            cells.append("-" if rank is None else f"{rank:+.2f}")
+        rows.append([f"{name} ({len(chosen)})", *cells])
+    for name, sign in (("mean error in %, marked", True), ("mean error in %, not marked", False)):
+        group = [j for j in judged if j.marked(limits) is sign]
+        errors = [np.mean([j.error[m] for j in group]) for m in MEASURES] if group else []
+        rows.append([f"{name} ({len(group)})", *(f"{100 * e:.1f}" for e in errors)])
+    print_table("Rank correlation of spread and error", ["over", *MEASURES], rows)
+    unseen = [j for j in judged if j.name == UNSEEN]
+    true = np.array([j.true_cost for j in unseen])
+    one, mean = (np.array([getattr(j, k) for j in unseen]) for k in ("first_cost", "mean_cost"))
+    print(
+        "Rank correlation of the objective with the truth, unseen layouts: the model alone "
+        f"{spearman(one, true)}, mean of all {spearman(mean, true)}"
+    )
+
+
+def write(folder: Path, members: list[str], limits: dict[str, float]) -> None:
+    """Put members and limits on the card of a checkpoint."""
+    card = read_card(folder)
+    card |= {"ensemble": members, "ensemble_limits": {k: round(v, 5) for k, v in limits.items()}}
+    write_whole(folder / CARD, (json.dumps(card, indent=2) + "\n").encode())
+    print(f"written to {folder / CARD}")
+
+
+@dataclass
+class Judgement:
+    """One scene: spread of the ensemble and error of its first model, by measure [-].
+
+    Attributes:
+        spread: see `design.ensemble.relative_spread`.
+        error: |value - truth| / truth, both relative to no baffles by the same simulator.
+        broken: limits on the card of the model that the scene lies outside of.
+        true_cost, first_cost, mean_cost: the objective by the solver, the first model, and all.
+    """
+
+    name: str
+    spread: dict[str, float]
+    error: dict[str, float]
+    broken: list[str]
+    true_cost: float
+    first_cost: float
+    mean_cost: float
+
+    @classmethod
+    def of(cls, case: Case) -> Judgement:
+        """From the rollouts of a case."""
+        objective = Objective()
+
+        def seen(values: dict[str, float], none: dict[str, float], status: str) -> Outcome:
+            return Outcome(objective.cost(values, none), values, status)
+
+        pairs = list(zip(case.members, case.members_none, strict=True))
+        outcomes = [seen(r.measures, n.measures, r.status) for r, n in pairs]
+        none = [seen(n.measures, n.measures, n.status) for n in case.members_none]
+        truth = seen(case.true, case.true_none, "ok")
+        error = {"cost": abs(outcomes[0].cost / truth.cost - 1)}
+        for m in MEASURES[1:]:
+            ours = outcomes[0].measures[m] / none[0].measures[m]
+            theirs = truth.measures[m] / case.true_none[m]
+            error[m] = abs(ours / theirs - 1) if theirs > 0.01 else abs(ours - theirs)
+        return cls(
+            case.name,
+            relative_spread(outcomes, none),
+            error,
+            case.broken,
+            truth.cost,
+            outcomes[0].cost,
+            float(np.mean([o.cost for o in outcomes])),
+        )
+
+    def marked(self, limits: dict[str, float]) -> bool:
+        """Whether one of the spreads is larger than its limit."""
+        return any(self.spread[m] > limits[m] for m in MEASURES)
 
 
 def collect(
@@ -109,7 +238,7 @@ def collect(
         scenes.append(truth.scene)
         truths.append(measures.summary(truth))
     outside = beyond()
-    names = ["unseen"] * len(scenes) + list(outside)
+    names = [UNSEEN] * len(scenes) + list(outside)
     # Names and placements do not flow: so that equal flows are simulated once.
     plain = [s.replace(name="flow", placement=None) for s in [*scenes, *outside.values()]]
     bare = [s.with_baffles([]) for s in plain]
@@ -133,6 +262,7 @@ def collect(
                 jobs[solver, key(none)].result().measures,
                 [jobs[spec, key(flow)].result() for spec in specs],
                 [jobs[spec, key(none)].result() for spec in specs],
+                beyond_limits(specs[0], plain[k]),
             )
         )
     return cases

@@ -6,7 +6,7 @@ from html import escape
 
 import numpy as np
 
-from design import animation, page, viewer, wording
+from design import animation, page, trust_page, viewer, wording
 from design.answer import HEADLINE
 from design.drawing import thumbnail
 from design.flow_figures import shown_flows
@@ -115,6 +115,7 @@ def trust(run: RunResults, pictures: Pictures) -> str:
     if count < 8:
         intro += " With so few layouts a correlation is an indication and no more."
     parts = [f'<div class="card" style="margin-bottom:16px">{page.table(head, rows)}</div>']
+    parts += [trust_page.depth(run), trust_page.refined(run)]
     captions = {
         "agreement": (
             "Learned against solver",

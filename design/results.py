@@ -47,6 +47,9 @@ class Design:
         verified_cost: objective by the reference solver, or None.
         origin: which part of the search proposed it.
         status: how the solver's rollout ended, "" where it has not run.
+        spread: of the ensemble, by measure; empty where there is none.
+        marks: why the learned simulator may be out of its depth here.
+        model: the refined model that found it, "" for the one that was given.
     """
 
     key: str
@@ -58,6 +61,9 @@ class Design:
     verified_cost: float | None = None
     origin: str = ""
     status: str = ""
+    spread: dict[str, float] = field(default_factory=dict)
+    marks: list[str] = field(default_factory=list)
+    model: str = ""
 
 
 @dataclass
@@ -212,6 +218,13 @@ class RunResults:
         design.verified_cost = _number(entry.get("verified_cost"))
         design.origin = str(entry.get("origin") or "")
         design.status = str(entry.get("verified_status") or "")
+        spread, marks = entry.get("spread"), entry.get("marks")
+        if isinstance(spread, dict):
+            known = {str(k): _number(v) for k, v in spread.items()}
+            design.spread = {k: v for k, v in known.items() if v is not None}
+        if isinstance(marks, list):
+            design.marks = [str(mark) for mark in marks]
+        design.model = str(entry.get("model") or "")
         for attribute, simulator in (("verified", SOLVER), ("surrogate", LEARNED)):
             if not getattr(design, attribute) and not key.startswith("rank-1"):
                 trajectory = self.trajectory(key, simulator)
@@ -261,7 +274,7 @@ def _same(a: np.ndarray | None, b: np.ndarray | None) -> bool:
 
 def _fill(design: Design, other: Design) -> None:
     """What the ranking knows of the best and its own entry does not."""
-    for name in ("surrogate", "verified", "cost", "verified_cost", "origin"):
+    for name in ("surrogate", "verified", "cost", "verified_cost", "origin", "spread", "marks"):
         if not getattr(design, name):
             setattr(design, name, getattr(other, name))
 
