@@ -20,7 +20,7 @@ from rich.progress import Progress
 
 from design.ensemble import Ensemble, beyond_limits, relative_spread
 from design.evaluators import SimulatorSpec
-from design.store import Rolled, RolloutStore, Watch
+from design.store import Pending, Rolled, RolloutStore, Watch
 from design.trials import Outcome
 from design.verify import spearman
 from design.workers import Workers
@@ -244,7 +244,8 @@ def collect(
     bare = [s.with_baffles([]) for s in plain]
     flows = list({json.dumps(s.to_dict()): s for s in [*plain, *bare]}.values())
     unsolved = [s for s in flows if s not in plain[: len(truths)]]
-    watch, jobs = Watch(bar), {}
+    watch = Watch(bar)
+    jobs: dict[tuple[SimulatorSpec, str], Pending] = {}
     for spec, asked in [(solver, unsolved), *((spec, flows) for spec in specs)]:
         started = [store.start(spec, s, trajectory=False) for s in asked]
         watch.add(f"{spec.name} {dict(spec.options) or ''}", started)
