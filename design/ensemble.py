@@ -10,6 +10,7 @@ layouts that the models have not seen.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -77,6 +78,18 @@ class Ensemble:
 
     def __bool__(self) -> bool:
         return len(self.members) > 1
+
+    def check(self, scenes: Sequence[Scene]) -> None:
+        """Refuse what a member cannot run. What it was not trained for is said of the searcher.
+
+        Raises:
+            SimulatorError, SceneError: as `Simulator.check`.
+        """
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            for spec in self.members[1:]:
+                for scene in scenes:
+                    spec.load().check(scene)
 
     def describe(self) -> dict[str, Any]:
         """Plain values for summary.json."""

@@ -50,7 +50,7 @@ class SimulatorSpec:
         return {**values, "weights": weights} if weights else values
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=8)
 def _simulator(spec: SimulatorSpec) -> Simulator:
     return load_simulator(spec.name, device=spec.device, **dict(spec.options))
 

@@ -7,6 +7,7 @@ keeps it from forgetting other flows but that rate, unless it is given the data 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -37,6 +38,9 @@ if TYPE_CHECKING:
 UNROLL = 10
 
 LEARNING_RATE = 3e-4
+
+#: What one process of the training takes with a batch of one flume, heap included [bytes].
+RANK_MEMORY = 4e9
 
 
 @dataclass(frozen=True)
@@ -118,9 +122,7 @@ def recipe_of(
     lessons = str(lesson.folder / "lessons")
     train = [lessons]
     if data is not None:
-        old = len(list(data.glob("*.h5")))
-        if old == 0:
-            raise FileFormatError(f"{data}: no trajectory files (*.h5) in this folder")
+        old = len(training_files(data))
         # Trajectories are drawn uniformly: half of the windows shall come from the new ones.
         train = [lessons] * max(1, round(old / len(scenes))) + [str(data)]
     return Recipe(
@@ -145,6 +147,18 @@ def recipe_of(
         precision="bfloat16",
         checkpoint_minutes=1.0,
     )
+
+
+def training_files(folder: Path) -> list[Path]:
+    """The trajectory files in `folder`, sorted.
+
+    Raises:
+        FileFormatError: if there are none.
+    """
+    paths = sorted(p for p in folder.glob("*.h5") if not p.name.startswith("."))
+    if not paths:
+        raise FileFormatError(f"{folder}: no trajectory files (*.h5) in this folder")
+    return paths
 
 
 def _lay_out(run: Run, lesson: Lesson, store: RolloutStore, watch: Watch) -> list[Scene]:
@@ -184,13 +198,22 @@ def _train(recipe: Recipe, lesson: Lesson, ranks: int, watch: Watch) -> None:
     def show() -> None:
         watch.bar.update(task, completed=min(budget, before + time.monotonic() - began))
 
-    code = launch(file, lesson.training, ranks, log=log, watch=show)
+    code = launch(file, lesson.training, _affordable(ranks), log=log, watch=show)
     if code != 0:
         lines = log.read_text(errors="replace").strip().splitlines() or [f"exit code {code}"]
         raise TrainingError(f"{lesson.training}: {lines[-1].removeprefix('error: ')}")
     if not state.exists() or read_position(state).seconds < budget:
         raise KeyboardInterrupt  # it was told to stop, and has saved its state
     watch.bar.update(task, completed=budget)
+
+
+def _affordable(ranks: int) -> int:
+    """At most `ranks` processes, and no more than find their memory free."""
+    with contextlib.suppress(OSError):  # Linux says what it could give, its caches included
+        for line in Path("/proc/meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return max(1, min(ranks, int(1024 * int(line.split()[1]) / RANK_MEMORY)))
+    return 1
 
 
 def _keep(lesson: Lesson, scenes: Sequence[Scene]) -> None:

@@ -23,10 +23,11 @@ import numpy as np
 from design.distinct import among
 from design.ensemble import Ensemble, is_learned
 from design.evaluators import SimulatorSpec
-from design.lessons import Lesson, teach
+from design.lessons import Lesson, teach, training_files
 from design.store import RolloutStore, Watch
 from design.summary import COMPLETE, PARTIAL
 from design.verify import Judged, gap, rank
+from gns_model.data.windows import read_source
 from gns_model.errors import SimulatorError
 
 if TYPE_CHECKING:
@@ -80,6 +81,9 @@ def check(run: Run) -> None:
                 f"--refine: the {what} of the reference solver, {theirs:g} {unit}, does not divide "
                 f"that of {s.simulator.name}, {mine:g} {unit}"
             )
+    if s.refine_data is not None:
+        # The first file tells whether the folder is the right one; training looks at them all.
+        read_source(training_files(s.refine_data)[0], spacing=config.spacing)
 
 
 def refine(run: Run, store: RolloutStore, workers: Workers, watch: Watch) -> None:

@@ -172,6 +172,7 @@ class Run:
         self.ensemble = (
             continued.ensemble if continued else Ensemble.of(settings.simulator, settings.ensemble)
         )
+        self.ensemble.check([scene, *self.flows])
         if settings.refine:
             refine.check(self)
         self.workers = settings.workers or max(1, min(default_count(), of_use))
@@ -311,6 +312,8 @@ class Run:
             },
             "versions": versions(),
         }
+        for spent in ("rollouts", "backwards"):
+            self.summary[spent] += sum(told[spent] for told in self.rounds)
         write_summary(self.out, self.summary)
         write_trials(self.out, self.log)
         write_layouts(self.out, self.bare, ranked)

@@ -84,6 +84,8 @@ class Settings:
             )
         if self.refine and not self.verify:
             raise SettingError("refine needs verified layouts: verify must be 1 or more, got 0")
+        if self.refine and self.objectives:
+            raise SettingError("refine goes with one objective, not with a Pareto front")
         if not (math.isfinite(self.refine_minutes) and self.refine_minutes > 0):
             raise SettingError(f"refine_minutes must be positive, got {self.refine_minutes:g}")
         if self.objectives:

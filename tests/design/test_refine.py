@@ -4,6 +4,7 @@ import json
 import os
 import signal
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -152,6 +153,7 @@ def test_the_gap_is_told_apart_for_taught_and_for_new_layouts(refined):
     assert told["same"]["before"] != told["same"]["after"]
     assert told["new"]["before"] != told["new"]["after"]
     assert told["steps"] > 0
+    assert summary["rollouts"] == 5 + told["rollouts"]
 
 
 def test_the_ensemble_judges_what_is_verified(refined):
@@ -187,7 +189,9 @@ def test_a_resumed_run_trains_and_simulates_nothing_again(refined, scene, monkey
     [
         ({"simulator": COARSE}, SimulatorError, "only a learned model"),
         ({"verifier": SimulatorSpec("mpm", options=(("spacing", 0.05),))}, SimulatorError, "0.05"),
+        ({"refine_data": Path("no/such/folder")}, FileFormatError, "no trajectory files"),
         ({"ensemble": ("nobody",)}, SimulatorError, "nobody"),
+        ({"ensemble": ("column-2d",)}, SimulatorError, "2D model"),
         ({"ensemble": ("mpm",)}, SimulatorError, "of learned models"),
     ],
 )
@@ -204,6 +208,8 @@ def test_what_cannot_be_refined_or_judged_is_refused_at_once(
 def test_settings_of_a_refinement_are_checked():
     with pytest.raises(SettingError, match="verify must be 1"):
         Settings(refine=1, verify=0)
+    with pytest.raises(SettingError, match="one objective"):
+        Settings(refine=1, objectives=("runout", "depth"))
     with pytest.raises(SettingError, match="refine_minutes"):
         Settings(refine=1, refine_minutes=0.0)
 
