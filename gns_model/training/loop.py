@@ -242,7 +242,9 @@ def _forward_and_backward(
     step = run.position.step
     autocast = recipe.precision == "bfloat16"
     context = torch.autocast(ranks.device.type, torch.bfloat16) if autocast else nullcontext()
-    if recipe.replay and progress >= 1 - recipe.unroll_fraction:
+    unrolled = progress >= 1 - recipe.unroll_fraction
+    rng = batches.generator(recipe.seed, batches.REPLAY, step)  # the same on all ranks
+    if recipe.replay and unrolled and rng.random() < recipe.replay_share:
         batch, edges = replay.take(step)
         with context:
             after = run.model.step(batch.history, batch.world)

@@ -77,6 +77,8 @@ class Recipe(BaseModel):
     #: steps for every window, and the most steps of one; see `replay`. 0: none.
     replay: Annotated[int, Field(ge=0)] = 0
     replay_steps: Count = 40
+    #: Share of the steps that are about them; the others look at true states and keep them right.
+    replay_share: Fraction = 0.5
     #: Let gradients flow through all K steps; else only through each step's own (push-forward).
     backprop_through_unroll: bool = False
 
