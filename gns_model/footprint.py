@@ -57,6 +57,19 @@ def bounding_size(size: ArrayLike, yaw: ArrayLike = 0.0) -> Array:
     return np.stack([a * cosine + b * sine, a * sine + b * cosine], axis=-1)
 
 
+def upstream_side(z: ArrayLike, center: ArrayLike, size: ArrayLike, yaw: float) -> Array:
+    """x at which a line along x meets a footprint first, coming from upstream [m], shape of `z`.
+
+    Of the two sides that face upstream the one that lies farther downstream, since the footprint
+    is convex. Meaningless where `z` [m] passes the footprint, and for quarter turns.
+    """
+    (a, b), (cosine, sine) = np.asarray(size, float) / 2, turn(yaw)
+    across = np.asarray(z, float) - np.asarray(center, float)[1]
+    one = -(a + sine * across) / cosine
+    other = -(b - math.copysign(cosine, sine) * across) / abs(sine)
+    return np.asarray(center, float)[0] + np.maximum(one, other)
+
+
 def separation(one: ArrayLike, other: ArrayLike) -> Array:
     """Signed distance of footprints given by their corners, (..., 4, 2) each [m], shape (...).
 

@@ -25,6 +25,7 @@ from typing import Literal
 import numpy as np
 
 from gns_model.errors import SceneError, SimulatorError
+from gns_model.footprint import bounding_size, upstream_side
 from gns_model.particles import STATIONARY
 from gns_model.scene import Scene
 from gns_model.trajectory import Trajectory
@@ -168,7 +169,8 @@ def upstream_depth_over_time(
 
     The depth is the `quantile` of the heights of the points' tops, y - base + spacing / 2, in the
     window face - window <= x <= face, |z - z_c| <= width / 2, and 0 where the window holds less
-    material than a layer of `least` [m].
+    material than a layer of `least` [m]. Of a turned baffle `width` is its extent across the flow
+    and `face` is, at every z, the x of its upstream side there.
 
     Without baffles it is the depth of the free flow, shape (T, W): the same in W windows of the
     same plan size that tile the placement area, or the plan downstream of the front if none.
@@ -181,11 +183,17 @@ def upstream_depth_over_time(
         return _tiled_depth(trajectory, positions, window, quantile, least)
     depth = np.zeros((frames, len(boxes)))
     columns = [np.ascontiguousarray(positions[:, :, axis]) for axis in range(scene.dim)]
-    for b, box in enumerate(boxes):
+    for b, (baffle, box) in enumerate(zip(scene.baffles, boxes, strict=True)):
         lower, upper = box[0, plan], box[1, plan]
         lower[0], upper[0] = box[0, 0] - window, box[0, 0]
+        size, yaw = baffle.unturned
         inside = np.ones(columns[0].shape, bool)
         for axis, lo, up in zip(plan, lower, upper, strict=True):
+            if axis == 0 and yaw:
+                face = upstream_side(columns[2], baffle.center, (size[0], size[2]), yaw)
+                inside &= columns[0] >= face - window
+                inside &= columns[0] <= face
+                continue
             inside &= columns[axis] >= lo
             inside &= columns[axis] <= up
         frame = np.nonzero(inside)[0]
@@ -211,6 +219,9 @@ def depth_tiles(scene: Scene, window: float = WINDOW_LENGTH) -> tuple[np.ndarray
         lower, upper = np.array(scene.placement.lower), np.array(scene.placement.upper)
     try:
         width = scene.baffle_size[2:]
+        if scene.dim == 3 and scene.baffle_yaw:
+            plan_size = (scene.baffle_size[0], scene.baffle_size[2])
+            width = (float(bounding_size(plan_size, scene.baffle_yaw)[1]),)
     except SceneError:
         width = (DEFAULT_WIDTH,) * (scene.dim - 2)
     size = np.array([window, *width])
@@ -263,11 +274,12 @@ def overtopping(trajectory: Trajectory) -> float:
     over = np.zeros(positions.shape[1], bool)
     plan = [0, *range(2, trajectory.scene.dim)]
     columns = [np.ascontiguousarray(positions[:, :, axis]) for axis in range(positions.shape[2])]
-    for lower, upper in trajectory.scene.baffle_boxes():
+    for (lower, upper), turn in zip(*trajectory.scene.oriented_boxes(), strict=True):
+        own = _in_frame(columns, lower, upper, turn)
         above = columns[1] >= upper[1] - CONTACT_SLACK
         for axis in plan:
-            above &= columns[axis] > lower[axis] + CONTACT_SLACK
-            above &= columns[axis] < upper[axis] - CONTACT_SLACK
+            above &= own[axis] > lower[axis] + CONTACT_SLACK
+            above &= own[axis] < upper[axis] - CONTACT_SLACK
         over |= above.any(axis=0)
     return float(over.mean())
 
@@ -276,13 +288,26 @@ def points_inside_baffles(trajectory: Trajectory, *, slack: float = 1e-5) -> int
     """Points that in some frame were deeper than `slack` [m] inside a baffle: 0 is right."""
     positions = moving_positions(trajectory)
     inside = np.zeros(positions.shape[1], bool)
-    for lower, upper in trajectory.scene.baffle_boxes():
+    columns = [positions[:, :, axis] for axis in range(positions.shape[2])]
+    for (lower, upper), turn in zip(*trajectory.scene.oriented_boxes(), strict=True):
         deep = np.ones(positions.shape[:2], bool)
-        for axis in range(positions.shape[2]):
-            deep &= positions[:, :, axis] > lower[axis] + slack
-            deep &= positions[:, :, axis] < upper[axis] - slack
+        for axis, values in enumerate(_in_frame(columns, lower, upper, turn)):
+            deep &= values > lower[axis] + slack
+            deep &= values < upper[axis] - slack
         inside |= deep.any(axis=0)
     return int(inside.sum())
+
+
+def _in_frame(
+    columns: list[np.ndarray], lower: np.ndarray, upper: np.ndarray, turn: np.ndarray
+) -> list[np.ndarray]:
+    """Coordinates x, y and z in the frame of a box turned about the vertical through its middle."""
+    cosine, sine = turn
+    if sine == 0:
+        return columns
+    middle = (lower + upper) / 2
+    x, z = columns[0] - middle[0], columns[2] - middle[2]
+    return [middle[0] + cosine * x + sine * z, columns[1], middle[2] + cosine * z - sine * x]
 
 
 # -- energy ----------------------------------------------------------------------------------------

@@ -36,6 +36,7 @@ def smooth_measures(
     centres: Tensor,
     sizes: Sequence[float] | Tensor,
     *,
+    yaws: float | Tensor = 0.0,
     temperature: float = TEMPERATURE,
     point_volume: float | None = None,
 ) -> dict[str, Tensor]:
@@ -46,6 +47,7 @@ def smooth_measures(
         scene: domain and control section; its own baffles are not looked at.
         centres: plan centres of the baffles [m], shape (B, D-1), (x, z) in 3D.
         sizes: of the baffles [m], shape (D,) for all or (B, D).
+        yaws: of the baffles [degrees], one for all or shape (B,).
         temperature: blur [m], positive.
         point_volume: of one point [m^D]; default: volume of the releases over N.
 
@@ -66,7 +68,13 @@ def smooth_measures(
             (last - scene.control_section) / (_SECTION * temperature)
         ).mean(),
         "upstream_depth": smooth_upstream_depth(
-            positions, scene, centres, sizes, point_volume, temperature=temperature
+            positions,
+            scene,
+            centres,
+            sizes,
+            point_volume,
+            yaws=yaws,
+            temperature=temperature,
         ),
     }
 
@@ -83,6 +91,7 @@ def smooth_upstream_depth(
     sizes: Sequence[float] | Tensor,
     point_volume: float,
     *,
+    yaws: float | Tensor = 0.0,
     temperature: float = TEMPERATURE,
 ) -> Tensor:
     """Soft maximum over frames and baffles of the depth just upstream of a baffle [m].
@@ -93,10 +102,12 @@ def smooth_upstream_depth(
     if len(centres) == 0:
         return _free_depth(positions, scene, point_volume)
     # Frame by frame and baffle by baffle, (T, B, N): 1.1 million numbers for a coarse flume.
-    weight = window_weights(positions, centres, sizes, _EDGE * temperature)
+    weight = window_weights(positions, centres, sizes, _EDGE * temperature, yaws=yaws)
     size = torch.as_tensor(sizes, dtype=positions.dtype, device=positions.device)
     size = size.expand(len(centres), positions.shape[2])
-    area = measures.WINDOW_LENGTH * size[:, 2:].prod(dim=1)
+    turn = _turn(yaws, centres, positions)
+    across = size[:, 2:].prod(dim=1) if turn is None else 2 * _half_across(size, turn)
+    area = measures.WINDOW_LENGTH * across
     mean_depth = weight.sum(dim=-1) * point_volume / area
     gate = torch.sigmoid((mean_depth - measures.LEAST_DEPTH) / (_GATE * temperature))
     half = measures.half_spacing(point_volume, scene.dim)
@@ -111,7 +122,12 @@ def smooth_upstream_depth(
 
 
 def window_weights(
-    positions: Tensor, centres: Tensor, sizes: Sequence[float] | Tensor, edge: float
+    positions: Tensor,
+    centres: Tensor,
+    sizes: Sequence[float] | Tensor,
+    edge: float,
+    *,
+    yaws: float | Tensor = 0.0,
 ) -> Tensor:
     """How much every point is in the window upstream of every baffle, 0 to 1, shape (T, B, N).
 
@@ -120,20 +136,60 @@ def window_weights(
         centres: [m], shape (B, D-1).
         sizes: [m], shape (D,) or (B, D).
         edge: width of the sigmoid edges [m].
+        yaws: [degrees], one for all or shape (B,).
     """
     size = torch.as_tensor(sizes, dtype=positions.dtype, device=positions.device)
     size = size.expand(len(centres), positions.shape[2])
-    face = (centres[:, 0] - size[:, 0] / 2)[:, None]
+    turn = _turn(yaws, centres, positions)
     x = positions[:, None, :, 0]
+    if turn is None:
+        face = (centres[:, 0] - size[:, 0] / 2)[:, None]
+    else:
+        across = positions[:, None, :, 2] - centres[:, 1, None]
+        face = centres[:, 0, None] + _upstream_side(across, size, turn, 2 * edge)
     weight = torch.sigmoid((x - face + measures.WINDOW_LENGTH) / edge) * torch.sigmoid(
         (face - x) / edge
     )
     for axis in range(2, positions.shape[2]):
         offset = positions[:, None, :, axis] - centres[:, axis - 1, None]
-        half = size[:, axis, None] / 2
+        half = size[:, axis, None] / 2 if turn is None else _half_across(size, turn)[:, None]
         weight = weight * torch.sigmoid((half - offset) / edge)
         weight = weight * torch.sigmoid((half + offset) / edge)
     return weight
+
+
+def _turn(yaws: float | Tensor, centres: Tensor, positions: Tensor) -> tuple[Tensor, Tensor] | None:
+    """Cosine and sine of the yaws, shape (B,) each; None if it is a plain 0."""
+    if isinstance(yaws, (int, float)) and yaws == 0:
+        return None
+    angle = torch.deg2rad(torch.as_tensor(yaws, dtype=positions.dtype, device=positions.device))
+    angle = angle.expand(len(centres))
+    return angle.cos(), angle.sin()
+
+
+def _half_across(size: Tensor, turn: tuple[Tensor, Tensor]) -> Tensor:
+    """Half the extent along z of turned baffles of sizes (B, 3) [m], shape (B,)."""
+    cosine, sine = turn
+    return (size[:, 0] * sine.abs() + size[:, 2] * cosine.abs()) / 2
+
+
+def _upstream_side(
+    across: Tensor, size: Tensor, turn: tuple[Tensor, Tensor], margin: float
+) -> Tensor:
+    """`footprint.upstream_side` about the centres, for offsets along z (T, B, N) [m].
+
+    A point nearer to the end of the baffle than `margin`, or past it, is given the side at that
+    distance from it. So the window of a baffle that is turned a little is that of one that is not
+    turned, moved a little: the end face, by then as steep as the flow is straight, has no part.
+    """
+    cosine, sine = (part[:, None] for part in turn)
+    reach = (_half_across(size, turn)[:, None] - margin).clamp(min=0)
+    across = torch.maximum(torch.minimum(across, reach), -reach)
+    a, b = size[:, 0, None] / 2, size[:, 2, None] / 2
+    tiny = 1e-9  # a side along the flow is infinitely far upstream, where the maximum drops it
+    one = -(a + sine * cosine.sign() * across) / cosine.abs().clamp(min=tiny)
+    other = -(b - cosine * sine.sign() * across) / sine.abs().clamp(min=tiny)
+    return torch.maximum(one, other)
 
 
 def smooth_quantile(

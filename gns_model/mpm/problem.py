@@ -63,8 +63,6 @@ class Discretisation:
 
     def check(self, scene: Scene) -> None:
         """Raise SimulatorError if `scene` would not fit in memory."""
-        if scene.is_turned:
-            raise SimulatorError("mpm does not yet simulate turned baffles: set their yaw to 0")
         dx = POINTS_PER_EDGE * self.spacing_of(scene)
         nodes = math.prod(s / dx + 5 for s in scene.domain.size)
         if nodes > MOST_NODES:
@@ -89,7 +87,10 @@ class Problem:
         start: its points at t = 0.
         lattice: the background grid.
         lower, upper: where points may be [m], shape (3,).
-        boxes: corners of the baffles, SKIN larger [m], shape (B, 2, 3).
+        boxes: corners of the baffles along the axes, SKIN larger [m], shape (B, 2, 3).
+        turned: corners of the turned baffles as they would stand unturned, likewise (K, 2, 3).
+            The top of one that reaches the lid is infinitely high: no way leads out there.
+        turns: cosine and sine of their yaw, shape (K, 2).
         solid: for each grid node 0, or the face of the baffle that it lies in, see `solid_nodes`.
         gravity: [m/s²], shape (3,).
         constants: of the material.
@@ -106,6 +107,8 @@ class Problem:
     lower: np.ndarray
     upper: np.ndarray
     boxes: np.ndarray
+    turned: np.ndarray
+    turns: np.ndarray
     solid: np.ndarray
     gravity: np.ndarray
     constants: MaterialConstants
@@ -169,9 +172,12 @@ def pose(scene: Scene, chosen: Discretisation) -> Problem:
     spacing = chosen.spacing_of(scene)
     lattice, lower, upper = _lattice(scene, POINTS_PER_EDGE * spacing)
     boxes = np.zeros((len(scene.baffles), 2, 3))
-    boxes[:, :, :dim] = scene.baffle_boxes()
+    boxes[:, :, :dim], turns = scene.oriented_boxes()
     boxes[:, 0] -= SKIN
     boxes[:, 1] += SKIN
+    askew = turns[:, 1] != 0
+    boxes, turned, turns = boxes[~askew], boxes[askew], turns[askew]
+    turned[turned[:, 1, 1] >= upper[1] - SKIN, 1, 1] = math.inf
     gravity = np.zeros(3)
     gravity[:dim] = scene.gravity
     fastest = _fastest(scene)
@@ -184,7 +190,9 @@ def pose(scene: Scene, chosen: Discretisation) -> Problem:
         lower=lower,
         upper=upper,
         boxes=boxes,
-        solid=solid_nodes(lattice, boxes, 0.5 * lattice.dx, lower, upper),
+        turned=turned,
+        turns=turns,
+        solid=solid_nodes(lattice, boxes, turned, turns, 0.5 * lattice.dx, lower, upper),
         gravity=gravity,
         constants=material_constants(scene.material),
         frame_interval=chosen.frame_interval,

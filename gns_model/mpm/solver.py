@@ -126,10 +126,10 @@ class MpmSimulator:
         ids = np.arange(count)
         arguments = (
             np.zeros((len(problem.solid), NODE_COLUMNS)), problem.lattice,
-            (0,) if dim == 2 else (0, 1, 2), problem.solid, problem.boxes, problem.gravity,
-            problem.constants, problem.point_mass, start.volume, scene.friction.base,
-            scene.friction.walls, scene.friction.baffles, problem.lower, problem.upper,
-            problem.keep, problem.dt, problem.substeps,
+            (0,) if dim == 2 else (0, 1, 2), problem.solid, problem.boxes, problem.turned,
+            problem.turns, problem.gravity, problem.constants, problem.point_mass, start.volume,
+            scene.friction.base, scene.friction.walls, scene.friction.baffles, problem.lower,
+            problem.upper, problem.keep, problem.dt, problem.substeps,
         )  # fmt: skip
         positions = np.empty((frames + 1, count, dim), np.float32)
         positions[0] = start.positions

@@ -14,7 +14,14 @@ import torch
 from torch import Tensor
 
 from gns_model.mpm.problem import Problem
-from gns_model.mpm.torch_contact import BoxContact, NodeContact, box_contacts, node_contacts
+from gns_model.mpm.torch_contact import (
+    BoxContact,
+    NodeContact,
+    TurnedContact,
+    box_contacts,
+    node_contacts,
+    turned_contacts,
+)
 from gns_model.mpm.torch_material import Materials, voigt_rows
 
 #: Nodes of a B-spline's support along an axis.
@@ -131,6 +138,7 @@ class Batch:
     materials: Materials
     nodes: list[NodeContact]
     boxes: list[BoxContact]
+    turned: list[TurnedContact]
 
     @classmethod
     def of(cls, problems: Sequence[Problem], device: torch.device) -> Batch:
@@ -196,4 +204,5 @@ class Batch:
             ),
             nodes=node_contacts(problems, device),
             boxes=box_contacts(problems, counts, device),
+            turned=turned_contacts(problems, counts, device),
         )

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gns_model.mpm.contact import SKIN
+from gns_model.mpm.contact import SKIN, TURNED
 from gns_model.mpm.problem import Problem
 from gns_model.mpm.transfer import PADDING
 
@@ -25,7 +25,7 @@ def slide(velocity: Tensor, normal: Tensor, mu: Tensor | None) -> Tensor:
     """Velocities [m/s], shape (K, D), after contact with faces: Coulomb friction.
 
     Args:
-        normal: outward unit normals, each along an axis, or 0 for no contact, shape (K, D).
+        normal: outward unit normals, or 0 for no contact, shape (K, D).
         mu: shape (K, 1); None for smooth faces.
     """
     approach = (velocity * normal).sum(1, keepdim=True).clamp_(max=0.0)
@@ -61,6 +61,7 @@ def node_contacts(problems: Sequence[Problem], device: torch.device) -> list[Nod
         normals = np.zeros((len(FACES) + 1, 3))
         for face, (axis, sign) in enumerate(FACES, start=1):
             normals[face, axis] = sign
+        normals = np.concatenate([normals, _side_normals(problem.turns)])
         inside = np.flatnonzero(problem.solid)
         found = [
             (inside, normals[problem.solid[inside]], np.full(len(inside), friction.baffles)),
@@ -81,6 +82,14 @@ def node_contacts(problems: Sequence[Problem], device: torch.device) -> list[Nod
         for index, normal, mu in joined
         if len(index)
     ]
+
+
+def _side_normals(turns: np.ndarray) -> np.ndarray:
+    """Outward normals of the sides -x, +x, -z, +z of turned boxes, (B, 2), shape (4 B, 3)."""
+    assert len(FACES) + 1 == TURNED, "sides of turned boxes have the codes after all faces"
+    (cosine, sine), none = turns.T, np.zeros(len(turns))
+    along, across = np.stack([cosine, none, sine], 1), np.stack([-sine, none, cosine], 1)
+    return np.stack([-along, along, -across, across], axis=1).reshape(-1, 3)
 
 
 def _walls(problem: Problem, axis: int, mu_low: float) -> tuple[np.ndarray, ...]:
@@ -130,10 +139,53 @@ class BoxContact:
         )
 
 
+@dataclass(frozen=True)
+class TurnedContact:
+    """As `BoxContact`, for baffles that are turned about the vertical.
+
+    Attributes:
+        middle, half: of every baffle in plan [m], shape (P, B, 2): half is minus infinity where
+            the point's scene has fewer baffles.
+        top: height of the top [m], infinite where it is flush with the lid, shape (P, B).
+        turns: cosine and sine of the yaw, shape (P, B, 2).
+        normals: outward normals of the faces in a baffle's frame, shape (5, 3).
+        mu: shape (P, 1).
+    """
+
+    middle: Tensor
+    half: Tensor
+    top: Tensor
+    turns: Tensor
+    normals: Tensor
+    mu: Tensor
+
+    def apply(self, position: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
+        """Put points that entered a baffle back on its nearest face, with friction there."""
+        cosine, sine = self.turns.unbind(2)
+        x, z = position[:, :1] - self.middle[..., 0], position[:, 2:] - self.middle[..., 1]
+        u, v = cosine * x + sine * z, cosine * z - sine * x
+        a, b = self.half.unbind(2)
+        depth = torch.stack([u + a, a - u, self.top - position[:, 1:2], v + b, b - v], dim=2)
+        depth = depth.masked_fill_((depth <= 0.0).any(2, keepdim=True), math.inf)
+        nearest, face = depth.flatten(1).min(1, keepdim=True)
+        touched = nearest < math.inf
+        along, up, across = self.normals.index_select(0, face[:, 0] % len(FACES)).T
+        own = torch.div(face, len(FACES), rounding_mode="floor")
+        cosine, sine = cosine.gather(1, own)[:, 0], sine.gather(1, own)[:, 0]
+        normal = torch.stack(
+            [cosine * along - sine * across, up, sine * along + cosine * across], 1
+        )
+        nearest = nearest.masked_fill(~touched, 0.0)
+        return (
+            torch.where(touched, torch.addcmul(position, normal, nearest), position),
+            torch.where(touched, slide(velocity, normal, self.mu), velocity),
+        )
+
+
 def box_contacts(
     problems: Sequence[Problem], counts: Tensor, device: torch.device
 ) -> list[BoxContact]:
-    """The baffles of all scenes, for scenes with `counts` points, shape (S,).
+    """The baffles along the axes of all scenes, which have `counts` points, shape (S,).
 
     The numba solver takes baffles one by one; where two touch, a point can be put from one into
     the other. So baffles that lie apart are resolved together, and those that touch in turn.
@@ -145,10 +197,9 @@ def box_contacts(
     normals = np.zeros((len(faces), dim))
     normals[np.arange(len(faces)), axes] = signs
     friction = [p.scene.friction.baffles for p in problems]
-    turns = [_turns(problem.boxes[:, :, :dim]) for problem in problems]
     contacts = []
-    for turn in range(max((max(t, default=-1) for t in turns), default=-1) + 1):
-        chosen = [p.boxes[np.array(t) == turn] for p, t in zip(problems, turns, strict=True)]
+    for now in _rounds([problem.boxes[:, :, :dim] for problem in problems]):
+        chosen = [p.boxes[n] for n, p in zip(now, problems, strict=True)]
         most = max(map(len, chosen))
         offset = np.full((len(problems), most, len(faces)), -math.inf)
         closed = np.zeros_like(offset)
@@ -172,11 +223,64 @@ def box_contacts(
     return contacts
 
 
-def _turns(boxes: np.ndarray) -> list[int]:
-    """For each box, shape (B, 2, D), the turn in which it is resolved: after all that come before
-    it and touch it."""
-    turns: list[int] = []
-    for n, box in enumerate(boxes):
-        touching = ((boxes[:n, 0] <= box[1]) & (boxes[:n, 1] >= box[0])).all(1)
-        turns.append(1 + max((turns[k] for k in np.flatnonzero(touching)), default=-1))
-    return turns
+def turned_contacts(
+    problems: Sequence[Problem], counts: Tensor, device: torch.device
+) -> list[TurnedContact]:
+    """As `box_contacts`, for the turned baffles."""
+    rounds = _rounds([_holding(p.turned, p.turns) for p in problems])
+    return [_turned_contact(problems, now, counts, device) for now in rounds]
+
+
+def _turned_contact(
+    problems: Sequence[Problem], chosen: list[np.ndarray], counts: Tensor, device: torch.device
+) -> TurnedContact:
+    """The chosen ones of the turned baffles of each scene."""
+    most = max(int(mask.sum()) for mask in chosen)
+    middle, half, turns = np.zeros((3, len(problems), most, 2))
+    top = np.zeros((len(problems), most))
+    half[:] = -math.inf
+    for row, (problem, mask) in enumerate(zip(problems, chosen, strict=True)):
+        low, high = problem.turned[mask][:, :, [0, 2]].swapaxes(0, 1)
+        n = len(low)
+        middle[row, :n], half[row, :n] = (low + high) / 2, (high - low) / 2
+        top[row, :n], turns[row, :n] = problem.turned[mask][:, 1, 1], problem.turns[mask]
+    normals = np.zeros((len(FACES), 3))
+    normals[np.arange(len(FACES)), [axis for axis, _ in FACES]] = [sign for _, sign in FACES]
+    friction = np.array([[p.scene.friction.baffles] for p in problems])
+
+    def by_point(values: np.ndarray) -> Tensor:
+        return torch.tensor(values, dtype=torch.float64, device=device).repeat_interleave(counts, 0)
+
+    return TurnedContact(
+        middle=by_point(middle),
+        half=by_point(half),
+        top=by_point(top),
+        turns=by_point(turns),
+        normals=torch.tensor(normals, device=device),
+        mu=by_point(friction),
+    )
+
+
+def _holding(turned: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    """Corners of boxes along the axes that hold turned ones, shape (B, 2, 3) [m]."""
+    low, high = turned[:, :, [0, 2]].swapaxes(0, 1)
+    middle, (a, b) = (low + high) / 2, (high - low).T / 2
+    cosine, sine = np.abs(turns).T
+    reach = np.stack([a * cosine + b * sine, a * sine + b * cosine], axis=1)
+    boxes = turned.copy()
+    boxes[:, :, [0, 2]] = np.stack([middle - reach, middle + reach], axis=1)
+    return boxes
+
+
+def _rounds(boxes: Sequence[np.ndarray]) -> list[list[np.ndarray]]:
+    """Which boxes of each scene, (B, 2, D) each, are resolved in each round, as masks (B,): every
+    one after all that come before it in its scene and touch it."""
+    number = []
+    for own in boxes:
+        rounds: list[int] = []
+        for n, box in enumerate(own):
+            touching = ((own[:n, 0] <= box[1]) & (own[:n, 1] >= box[0])).all(1)
+            rounds.append(1 + max((rounds[k] for k in np.flatnonzero(touching)), default=-1))
+        number.append(np.array(rounds, dtype=int))
+    last = max((int(n.max(initial=-1)) for n in number), default=-1)
+    return [[n == k for n in number] for k in range(last + 1)]

@@ -93,3 +93,7 @@ def grid_to_points(state: State, node: Tensor, basis: Tensor, grid: Tensor, batc
     torch.clamp(position, batch.lower, batch.upper, out=state.position)
     inwards = (state.position - position) * velocity
     torch.mul(velocity, inwards >= 0.0, out=state.velocity)
+    for turned in batch.turned:
+        position, velocity = turned.apply(state.position, state.velocity)
+        torch.clamp(position, batch.lower, batch.upper, out=state.position)
+        state.velocity.copy_(velocity)

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from gns_model.mpm.contact import box_contact, slide
+from gns_model.mpm.contact import TURNED, box_contact, slide, turned_contact, turned_slide
 from gns_model.mpm.material import advance_stress
 
 #: Columns of the point array: position, velocity, affine velocity, stress, log volume strain.
@@ -171,11 +171,11 @@ def points_to_grid(points, grid, lattice, layers, starts, order, first, last, ma
 
 
 @njit(parallel=True, cache=True)
-def update_grid(grid, lattice, bounds, gravity, mu_base, mu_walls, mu_baffles, solid, dt):
+def update_grid(grid, lattice, bounds, gravity, mu_base, mu_walls, mu_baffles, solid, turns, dt):
     """Momentum to velocities, gravity, and contact with base, walls and nodes inside baffles.
 
     `solid` gives each node 0, or 1 + the outward face of the baffle it lies in (-x, +x, +y, -z,
-    +z in this order).
+    +z in this order), or the code of the side of a turned baffle; see `contact.solid_nodes`.
     """
     top_x = min(bounds[1] + 3, lattice.nx)
     for i in prange(max(bounds[0] - 2, 0), top_x):
@@ -200,6 +200,8 @@ def update_grid(grid, lattice, bounds, gravity, mu_base, mu_walls, mu_baffles, s
                     vz, vx, vy = slide(vz, vx, vy, -1.0, mu_baffles)
                 elif solid[index] == 5:
                     vz, vx, vy = slide(vz, vx, vy, 1.0, mu_baffles)
+                elif solid[index] >= TURNED:
+                    vx, vy, vz = turned_slide(vx, vy, vz, solid[index], turns, mu_baffles)
                 if i <= PADDING:
                     vx, vy, vz = slide(vx, vy, vz, 1.0, mu_walls)
                 elif i >= lattice.wall_x:
@@ -340,10 +342,39 @@ def grid_to_points(
         speeds[block] = fastest
 
 
+@njit(parallel=True, cache=True)
+def leave_turned_boxes(points, starts, turned, turns, mu_baffles, lower, upper, speeds):
+    """Resolve contact with turned baffles, (B, 2, 3) with turns (B, 2), and the domain once more.
+
+    Apart from `grid_to_points`, which a call would make slower for scenes that turn nothing.
+    `speeds` grows by the longest way of each block's points here [m].
+    """
+    for block in prange(starts.shape[0] - 1):
+        farthest = 0.0
+        for p in range(starts[block], starts[block + 1]):
+            x, y, z = points[p, 0], points[p, 1], points[p, 2]
+            for b in range(turned.shape[0]):
+                (
+                    points[p, 0], points[p, 1], points[p, 2],
+                    points[p, 3], points[p, 4], points[p, 5],
+                ) = turned_contact(
+                    points[p, 0], points[p, 1], points[p, 2],
+                    points[p, 3], points[p, 4], points[p, 5],
+                    turned[b], turns[b, 0], turns[b, 1], mu_baffles,
+                )  # fmt: skip
+            way = max(abs(points[p, 0] - x), max(abs(points[p, 1] - y), abs(points[p, 2] - z)))
+            if way > 0.0:
+                farthest = max(farthest, way)
+                for axis in range(3):
+                    # Rounding, where a corner touches a wall.
+                    points[p, axis] = min(max(points[p, axis], lower[axis]), upper[axis])
+        speeds[block] += farthest
+
+
 @njit(cache=True)
 def advance(
-    points, ids, spare, spare_ids, grid, lattice, layers, solid, boxes, gravity, constants,
-    mass, volume, mu_base, mu_walls, mu_baffles, lower, upper, keep, dt, substeps,
+    points, ids, spare, spare_ids, grid, lattice, layers, solid, boxes, turned, turns, gravity,
+    constants, mass, volume, mu_base, mu_walls, mu_baffles, lower, upper, keep, dt, substeps,
 ):  # fmt: skip
     """Advance all points by `substeps` substeps of dt [s]; returns the two arrays that hold them.
 
@@ -365,11 +396,15 @@ def advance(
                         points, grid, lattice, layers, starts, order,
                         colours[colour], colours[colour + 1], mass, volume, dt,
                     )  # fmt: skip
-            update_grid(grid, lattice, bounds, gravity, mu_base, mu_walls, mu_baffles, solid, dt)
+            update_grid(
+                grid, lattice, bounds, gravity, mu_base, mu_walls, mu_baffles, solid, turns, dt
+            )
             grid_to_points(
                 points, grid, lattice, layers, starts, keep, constants, boxes, mu_baffles,
                 lower, upper, dt, speeds,
             )  # fmt: skip
+            if turned.shape[0] > 0:
+                leave_turned_boxes(points, starts, turned, turns, mu_baffles, lower, upper, speeds)
             done += 1
             fastest = 0.0
             for b in range(speeds.shape[0]):
@@ -405,4 +440,5 @@ advance_serial = _serial(
     update_grid=_serial(update_grid),
     clear_grid=_serial(clear_grid),
     grid_to_points=_serial(grid_to_points),
+    leave_turned_boxes=_serial(leave_turned_boxes),
 )

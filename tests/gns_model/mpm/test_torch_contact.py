@@ -105,7 +105,7 @@ def test_nodes_slide_as_numbas(scene):
     bounds = np.array([0, lattice.nx, 0, lattice.ny, 0, lattice.nz])
     update_grid(
         grid, lattice, bounds, np.zeros(3), friction.base, friction.walls, friction.baffles,
-        problem.solid, 0.0,
+        problem.solid, problem.turns, 0.0,
     )  # fmt: skip
     for contact in by_torch.node_contacts([problem], CPU):
         contact.apply(velocity)

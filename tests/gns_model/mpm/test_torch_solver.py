@@ -52,6 +52,14 @@ BLOCK = Scene.from_dict(
         "duration": 0.2,
     }
 )
+TURNED = BLOCK.replace(
+    name="a block that hits two turned baffles and one along the axes between them",
+    baffles=(
+        {"center": (0.45, 0.15), "size": (0.08, 0.3, 0.2), "yaw": 30.0},
+        {"center": (0.5, 0.3), "size": (0.1, 0.2, 0.06)},
+        {"center": (0.45, 0.45), "size": (0.15, 0.2, 0.1), "yaw": -50.0},
+    ),
+)
 TOSSED = draw("barriers", 2, 1).replace(duration=0.12)
 SPACING = {2: 0.025, 3: 0.04}
 
@@ -69,10 +77,10 @@ def by_numba(problem, substeps):
     points, ids, _, _ = advance_serial(
         points, ids, np.empty_like(points), np.empty_like(ids),
         np.zeros((len(problem.solid), NODE_COLUMNS)), problem.lattice,
-        (0, 1, 2) if dim == 3 else (0,), problem.solid, problem.boxes, problem.gravity,
-        problem.constants, problem.point_mass, problem.start.volume, friction.base,
-        friction.walls, friction.baffles, problem.lower, problem.upper, problem.keep,
-        problem.dt, substeps,
+        (0, 1, 2) if dim == 3 else (0,), problem.solid, problem.boxes, problem.turned,
+        problem.turns, problem.gravity, problem.constants, problem.point_mass,
+        problem.start.volume, friction.base, friction.walls, friction.baffles, problem.lower,
+        problem.upper, problem.keep, problem.dt, substeps,
     )  # fmt: skip
     points = points[np.argsort(ids)]
     return points[:, :dim], points[:, 3 : 3 + dim], points[:, 15:21], points[:, STRAIN]
@@ -96,7 +104,7 @@ def assert_same(one, other, *, metres):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-6 * np.abs(a).max())
 
 
-@pytest.mark.parametrize("scene", [COLUMN, FLYING, BLOCK, TOSSED], ids=lambda s: s.name)
+@pytest.mark.parametrize("scene", [COLUMN, FLYING, BLOCK, TURNED, TOSSED], ids=lambda s: s.name)
 def test_equals_numba_over_100_substeps_and_at_the_end(scene):
     problem = posed(scene)
     assert_same(by_numba(problem, 100), by_torch([problem], 100)[0], metres=1e-9)
