@@ -165,7 +165,7 @@ def smooth_costs(
     reference, size = task.reference, tuple(task.space.size)
     costs = []
     for positions, scene, c in zip(rollouts, scenes, centres, strict=True):
-        measures = smooth_measures(positions, scene, c.to(positions), size)
+        measures = smooth_measures(positions, scene, c.to(positions), size, yaws=task.space.yaw)
         terms = [objective.smooth(measures, reference) for objective in task.objectives]
         costs.append(torch.stack([term.to(torch.float64).cpu() for term in terms]).sum())
     return rollouts, torch.stack(costs)

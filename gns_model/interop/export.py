@@ -19,7 +19,7 @@ import torch
 from gns_model.errors import FileFormatError
 from gns_model.interop.metadata import Metadata, read_json
 from gns_model.learned.config import ModelConfig
-from gns_model.learned.world import baffle_boxes, baffle_points
+from gns_model.learned.world import baffle_points, baffle_poses
 from gns_model.particles import STATIONARY
 from gns_model.scene import write_whole
 from gns_model.trajectory import Trajectory, open_trajectory
@@ -134,8 +134,8 @@ def _parts(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         friction = np.full(len(kinds), math.tan(angle), np.float32)
     if trajectory.scene.baffles:
         spacing = trajectory.point_volume ** (1 / trajectory.scene.dim)
-        boxes = baffle_boxes(trajectory.scene, dtype=torch.float64)
-        fixed = baffle_points(boxes, spacing).numpy().astype(np.float32)
+        boxes, turns = baffle_poses(trajectory.scene, dtype=torch.float64)
+        fixed = baffle_points(boxes, spacing, turns).numpy().astype(np.float32)
         still = np.broadcast_to(fixed, (len(positions), *fixed.shape))
         positions = np.concatenate([positions, still], axis=1)
         kinds = np.concatenate([kinds, np.full(len(fixed), STATIONARY)])

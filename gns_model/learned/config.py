@@ -37,6 +37,8 @@ class Limits(BaseModel):
     baffle_friction: Range | None = None  #: [-]
     baffle_height: Range | None = None  #: [m]
     baffle_width: Range | None = None  #: both plan sizes [m]
+    #: [degrees], of turned baffles; None with a known baffle_height: all stood along the axes
+    baffle_yaw: Range | None = None
 
     @classmethod
     def of(cls, scenes: Iterable[Scene]) -> Limits:
@@ -69,6 +71,11 @@ class Limits(BaseModel):
         lines = []
         for name, values in _extent(scene).items():
             limit = getattr(self, name)
+            if name == "baffle_yaw" and limit is None and self.baffle_height is not None:
+                steepest = max(values, key=abs)
+                lines.append(
+                    f"{name} = {steepest:g} degrees, but trained on baffles along the axes"
+                )
             if limit is None:
                 continue
             low, high = limit if isinstance(limit, tuple) else (0.0, limit)
@@ -97,6 +104,8 @@ def _extent(scene: Scene) -> dict[str, list[float]]:
         extent["baffle_friction"] = [scene.friction.baffles]
         extent["baffle_height"] = [b.size[1] for b in scene.baffles]
         extent["baffle_width"] = [s for b in scene.baffles for s in (b.size[0], *b.size[2:])]
+        if scene.is_turned:
+            extent["baffle_yaw"] = [b.unturned[1] for b in scene.baffles]
     return extent
 
 

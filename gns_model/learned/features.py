@@ -40,19 +40,45 @@ def wall_features(
     return fade(distance, reach)
 
 
-def signed_distance(positions: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:
-    """Distance to axis-aligned boxes, negative inside, and its gradient, the outward normal.
+def into_frames(positions: Tensor, frames: Tensor) -> Tensor:
+    """Positions as they are seen from boxes turned about the vertical, shape (..., 3) [m].
+
+    Args:
+        positions: [m], shape (..., 3).
+        frames: middle (x, z) [m], cosine and sine of the yaw, shape (..., 4).
+    """
+    x, z, cosine, sine = frames.unbind(-1)
+    dx, dz = positions[..., 0] - x, positions[..., 2] - z
+    y = positions[..., 1].expand_as(x)
+    return torch.stack([x + (cosine * dx + sine * dz), y, z + (cosine * dz - sine * dx)], dim=-1)
+
+
+def out_of_frames(positions: Tensor, frames: Tensor) -> Tensor:
+    """The inverse of `into_frames`."""
+    x, z, cosine, sine = frames.unbind(-1)
+    return into_frames(positions, torch.stack([x, z, cosine, -sine], dim=-1))
+
+
+def signed_distance(
+    positions: Tensor, boxes: Tensor, frames: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Distance to boxes, negative inside, and its gradient, the outward normal.
 
     Args:
         positions: [m], shape (N, D).
         boxes: corners [m], shape (N, M, 2, D).
+        frames: in which the boxes lie along the axes, see `into_frames`, shape (N, M, 4); None:
+            they lie along the axes as it is.
 
     Returns:
         distance [m], shape (N, M), and unit normal, shape (N, M, D). On a face the normal is the
         face's, and beyond an edge or a corner it points away from the nearest point.
     """
-    below = boxes[:, :, 0] - positions[:, None]
-    above = positions[:, None] - boxes[:, :, 1]
+    seen = positions[:, None]
+    if frames is not None:
+        seen = into_frames(seen, frames)
+    below = boxes[:, :, 0] - seen
+    above = seen - boxes[:, :, 1]
     beyond = torch.maximum(below, above)
     sign = torch.where(above > below, 1.0, -1.0).to(positions.dtype)
     excess = beyond.clamp(min=0)
@@ -63,10 +89,18 @@ def signed_distance(positions: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:
     inner, axis = beyond.max(-1)
     face = torch.nn.functional.one_hot(axis, positions.shape[1]).to(positions.dtype)
     normal = sign * torch.where(outside[..., None], excess / distance[..., None], face)
+    if frames is not None:
+        along, up, across = normal.unbind(-1)
+        cosine, sine = frames[..., 2], frames[..., 3]
+        normal = torch.stack(
+            [cosine * along - sine * across, up, sine * along + cosine * across], -1
+        )
     return torch.where(outside, distance, inner), normal
 
 
-def baffle_features(positions: Tensor, velocity: Tensor, boxes: Tensor, reach: float) -> Tensor:
+def baffle_features(
+    positions: Tensor, velocity: Tensor, boxes: Tensor, reach: float, frames: Tensor | None = None
+) -> Tensor:
     """Sum over the boxes of w(d) · (1, normal, velocity · normal), shape (N, D + 2).
 
     Args:
@@ -74,10 +108,11 @@ def baffle_features(positions: Tensor, velocity: Tensor, boxes: Tensor, reach: f
         velocity: shape (N, D), in any unit in which 1 is usual.
         boxes: shape (N, M, 2, D).
         reach: where w vanishes [m].
+        frames: of the boxes, see `signed_distance`.
     """
     if boxes.shape[1] == 0:
         return positions.new_zeros((len(positions), positions.shape[1] + 2))
-    distance, normal = signed_distance(positions, boxes)
+    distance, normal = signed_distance(positions, boxes, frames)
     weight = fade(distance, reach)[..., None]
     approach = (normal * velocity[:, None]).sum(-1, keepdim=True)
     return (weight * torch.cat([torch.ones_like(weight), normal, approach], dim=-1)).sum(1)

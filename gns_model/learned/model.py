@@ -112,7 +112,11 @@ class LearnedModel(nn.Module):
             usual = self.velocity_std.square().mean().sqrt()
             parts.append(
                 features.baffle_features(
-                    positions, velocity / usual, world.point_boxes, config.baffle_range
+                    positions,
+                    velocity / usual,
+                    world.point_boxes,
+                    config.baffle_range,
+                    world.point_frames,
                 )
             )
         if config.material_features:

@@ -124,11 +124,14 @@ def roll_out_tensor(
     limit: float | None,
     velocities: Sequence[Tensor] | None = None,
     tan_friction: Sequence[Tensor] | None = None,
+    sizes: Sequence[Tensor] | None = None,
+    yaws: Sequence[Tensor] | None = None,
 ) -> list[Tensor]:
     """As `LearnedSimulator.rollout_tensor`, which see."""
     config = model.config
     lengths = [frames or frame_count(config, scene) for scene in scenes]
-    starts = start(config, scenes, points, centres, **place(model))
+    poses: dict[str, Any] = {"centres": centres, "sizes": sizes, "yaws": yaws}
+    starts = start(config, scenes, points, **poses, **place(model))
     if velocities is not None:
         starts = [
             launched(config, s, p, v) for s, p, v in zip(starts, points, velocities, strict=True)
@@ -142,7 +145,7 @@ def roll_out_tensor(
     if noise is not None:
         for history, shift, n in zip(histories, noise, moving, strict=True):
             history[:n] += shift.to(history)[:, None]
-    world = _world(scenes, starts, model, centres)
+    world = _world(scenes, starts, model, **poses)
     depth = config.history + 1
 
     def step(*past: Tensor) -> Tensor:
@@ -181,13 +184,13 @@ def _world(
     scenes: Sequence[Scene],
     starts: Sequence[Start],
     model: LearnedModel,
-    centres: Sequence[Tensor] | None = None,
+    **poses: Any,
 ) -> World:
     friction = [s.tan_friction for s in starts if s.tan_friction is not None]
     return World.from_scenes(
         scenes,
         [len(s.history) for s in starts],
-        centres=centres,
+        **poses,
         particle_type=torch.cat([s.particle_type for s in starts]),
         tan_friction=torch.cat(friction) if len(friction) == len(starts) else None,
         **place(model),

@@ -93,10 +93,6 @@ class LearnedSimulator:
                 f"{self.name} is a {self.config.dim}D model and the scene {scene.name!r} is "
                 f"{scene.dim}D"
             )
-        if scene.is_turned:
-            raise SimulatorError(
-                f"{self.name} does not yet simulate turned baffles: set their yaw to 0"
-            )
         if scene.baffles and self.config.baffles == "none":
             raise SimulatorError(
                 f"{self.name} does not see baffles, and the scene {scene.name!r} has "
@@ -343,6 +339,8 @@ class LearnedSimulator:
         limit: float | None = None,
         velocities: Sequence[Tensor] | None = None,
         tan_friction: Sequence[Tensor] | None = None,
+        sizes: Sequence[Tensor] | None = None,
+        yaws: Sequence[Tensor] | None = None,
     ) -> list[Tensor]:
         """A rollout that autograd can differentiate: in the baffles, the release or the friction.
 
@@ -351,7 +349,7 @@ class LearnedSimulator:
         Args:
             scenes: one batch; all are run together.
             centres: plan centres of the baffles [m], a tensor (B, D-1) for each scene, in place of
-                the scene's own; sizes stay.
+                the scene's own.
             frames: number of frames to return, the start included; default: as long as each scene.
             checkpoint: recompute every step in the backward pass, so that memory holds positions
                 and the inside of one step only.
@@ -362,6 +360,9 @@ class LearnedSimulator:
                 scene, in place of the scene's.
             tan_friction: tan of the friction angle, a tensor () or (N,) for each scene, in place of
                 the scene's; the model has to see it.
+            sizes: of the baffles [m], a tensor (B, D) for each scene, in place of the scene's.
+            yaws: of the baffles [degrees], a tensor (B,) for each scene, in place of the scene's;
+                3D only.
 
         Returns:
             positions [m], (T, N, D) for each scene, in the dtype of the model.
@@ -374,6 +375,8 @@ class LearnedSimulator:
             self.check(scene)
         if tan_friction is not None and "tan_friction_angle" not in self.config.material_features:
             raise SimulatorError(f"{self.name} does not see the friction angle")
+        if yaws is not None and self.config.dim != 3:
+            raise SimulatorError("only baffles in 3D can be turned")
         points = [self._fill(scene) for scene in scenes]
         with self._settings():
             return roll_out_tensor(
@@ -387,6 +390,8 @@ class LearnedSimulator:
                 limit=limit,
                 velocities=velocities,
                 tan_friction=tan_friction,
+                sizes=sizes,
+                yaws=yaws,
             )
 
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from gns_model.errors import SimulatorError
 from gns_model.learned.config import ModelConfig
-from gns_model.learned.world import baffle_boxes, baffle_points
+from gns_model.learned.world import baffle_points, baffle_poses
 from gns_model.particles import MOVING, STATIONARY, Points
 from gns_model.scene import Scene
 
@@ -48,6 +49,8 @@ def start(
     points: Sequence[Points],
     centres: Sequence[Tensor] | None = None,
     *,
+    sizes: Sequence[Tensor] | None = None,
+    yaws: Sequence[Tensor] | None = None,
     device: torch.device | str = "cpu",
     dtype: torch.dtype = torch.float32,
 ) -> list[Start]:
@@ -60,7 +63,8 @@ def start(
 
     Args:
         points: the moving points of each scene, at the spacing of the model.
-        centres: of the baffles, in place of the scenes' own; only kinematic points read it.
+        centres, sizes, yaws: of the baffles, in place of the scenes' own; only kinematic points
+            read them.
     """
     starts = []
     past = torch.arange(config.history, -1, -1, dtype=dtype, device=device)
@@ -76,9 +80,12 @@ def start(
             history = history[:, -len(past) :]
         kind = torch.full((len(position),), MOVING, device=device)
         if config.baffles == "points":
-            own = centres[k] if centres is not None else None
-            boxes = baffle_boxes(scene, own, device=device, dtype=dtype)
-            fixed = baffle_points(boxes, config.spacing)
+            own = {"centres": centres, "sizes": sizes, "yaws": yaws}
+            given: dict[str, Any] = {
+                name: values[k] for name, values in own.items() if values is not None
+            }
+            boxes, turns = baffle_poses(scene, **given, device=device, dtype=dtype)
+            fixed = baffle_points(boxes, config.spacing, turns)
             history = torch.cat([history, fixed[:, None].expand(-1, len(past), -1)])
             kind = torch.cat([kind, kind.new_full((len(fixed),), STATIONARY)])
         starts.append(Start(history, kind, len(position), before=before))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gns_model import footprint
 from gns_model.scene import Scene, Vector
 
 
@@ -35,7 +36,12 @@ def mirrored(scene: Scene) -> Scene:
         for r in scene.releases
     )
     baffles = tuple(
-        b.model_copy(update={"center": _put(b.center, plan, total - b.center[plan])})
+        b.model_copy(
+            update={
+                "center": _put(b.center, plan, total - b.center[plan]),
+                "yaw": footprint.wrap(-b.yaw),
+            }
+        )
         for b in scene.baffles
     )
     placement = scene.placement
@@ -44,6 +50,7 @@ def mirrored(scene: Scene) -> Scene:
         placement = placement.model_copy(
             update={
                 **box(placement.lower, placement.upper, plan),
+                "yaw": footprint.wrap(-placement.yaw) if placement.yaw else placement.yaw,
                 "keep_out": tuple(
                     _put(_put(r, plan, total - r[other]), other, total - r[plan])
                     for r in placement.keep_out

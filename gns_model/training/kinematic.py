@@ -13,7 +13,7 @@ import numpy as np
 
 from gns_model.data.windows import Window
 from gns_model.learned.config import ModelConfig
-from gns_model.learned.world import baffle_boxes, baffle_points
+from gns_model.learned.world import baffle_points, baffle_poses
 from gns_model.particles import STATIONARY
 
 
@@ -24,7 +24,8 @@ def kinematic_spacing(config: ModelConfig) -> float | None:
 
 def with_baffle_points(window: Window, spacing: float) -> Window:
     """The window with its baffles as kinematic points, `spacing` [m] apart, after all others."""
-    fixed = baffle_points(baffle_boxes(window.scene), spacing).numpy()
+    boxes, turns = baffle_poses(window.scene)
+    fixed = baffle_points(boxes, spacing, turns).numpy()
     count = len(fixed)
     tangent = math.tan(math.radians(window.scene.material.friction_angle))
 
