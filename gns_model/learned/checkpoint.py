@@ -5,9 +5,10 @@ The card (JSON, format `gns-model`, version 1) holds `name`, `config` (ModelConf
 the trainer adds: `trained_on`, `scores`, notes, and `verdict`, a line that whoever loads the model
 shall read (a model that misses its aims). `ensemble` names further models (shipped, or folders
 relative to this one) that a design search asks beside it, and `ensemble_limits` how far they may
-differ by measure (`design/ensemble.py`, written by `benchmarks/ensemble.py`). Each file is written whole; the checksum tells a
-card from the weights of another save. The weights carry a copy of their card and a checksum of
-their tensors, which count where a process was killed between the two files. Nothing is unpickled.
+differ by measure (`design/ensemble.py`, written by `benchmarks/ensemble.py`). Each file is written
+whole; the checksum tells a card from the weights of another save. The weights carry a copy of their
+card and a checksum of their tensors, which count where a process was killed between the two files.
+Nothing is unpickled.
 """
 
 from __future__ import annotations
