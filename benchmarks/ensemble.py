@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -112,6 +113,11 @@ def main() -> None:
     limits = {m: max(j.spread[m] for j in unseen) for m in MEASURES}
     print_cases(judged, limits)
     print_correlations(judged, limits)
+    alarms = sum(
+        j.marked({m: max(o.spread[m] for o in unseen if o is not j) for m in MEASURES})
+        for j in unseen
+    )
+    print(f"By limits from the others, {alarms} of {len(unseen)} unseen layouts would be marked")
     print("Limits: the largest spread over the unseen layouts, " + json.dumps(limits))
     if arguments.write is not None:
         write(arguments.write, [s.name for s in specs[1:]], limits)
@@ -129,7 +135,7 @@ def print_cases(judged: Sequence[Judgement], limits: dict[str, float]) -> None:
             spread, error = (
                 np.mean([getattr(j, k)[m] for j in group]) for k in ("spread", "error")
             )
-            row.append(f"{100 * spread:.1f} / {100 * error:.1f}")
+            row.append(f"{100 * spread:.2f} / {100 * error:.2f}" if spread == spread else "-")
         row.append(f"{marked} of {len(group)}")
         row.append("; ".join(sorted({line.split(" = ")[0] for j in group for line in j.broken})))
         rows.append(row)
@@ -150,13 +156,13 @@ def print_correlations(judged: Sequence[Judgement], limits: dict[str, float]) ->
     ):
         cells = []
         for m in MEASURES:
-            spread = np.array([j.spread[m] for j in chosen])
-            rank = spearman(spread, np.array([j.error[m] for j in chosen]))
+            pairs = np.array([(j.spread[m], j.error[m]) for j in chosen])
+            rank = spearman(*pairs[np.isfinite(pairs).all(axis=1)].T)
             cells.append("-" if rank is None else f"{rank:+.2f}")
         rows.append([f"{name} ({len(chosen)})", *cells])
     for name, sign in (("mean error in %, marked", True), ("mean error in %, not marked", False)):
         group = [j for j in judged if j.marked(limits) is sign]
-        errors = [np.mean([j.error[m] for j in group]) for m in MEASURES] if group else []
+        errors = [np.nanmean([j.error[m] for j in group]) for m in MEASURES] if group else []
         rows.append([f"{name} ({len(group)})", *(f"{100 * e:.1f}" for e in errors)])
     print_table("Rank correlation of spread and error", ["over", *MEASURES], rows)
     unseen = [j for j in judged if j.name == UNSEEN]
@@ -208,13 +214,17 @@ class Judgement:
         none = [seen(n.measures, n.measures, n.status) for n in case.members_none]
         truth = seen(case.true, case.true_none, "ok")
         error = {"cost": abs(outcomes[0].cost / truth.cost - 1)}
+        spread = relative_spread(outcomes, none)
         for m in MEASURES[1:]:
+            if m not in spread or min(case.true[m], case.true_none[m]) < 1e-6:
+                spread[m] = error[m] = math.nan  # nothing passes the section
+                continue
             ours = outcomes[0].measures[m] / none[0].measures[m]
-            theirs = truth.measures[m] / case.true_none[m]
-            error[m] = abs(ours / theirs - 1) if theirs > 0.01 else abs(ours - theirs)
+            theirs = case.true[m] / case.true_none[m]
+            error[m] = abs(ours / theirs - 1)
         return cls(
             case.name,
-            relative_spread(outcomes, none),
+            spread,
             error,
             case.broken,
             truth.cost,
