@@ -110,17 +110,23 @@ def main() -> None:
     print("Simulators: " + ", ".join(f"{s.name} {dict(s.options) or ''}".strip() for s in specs))
     judged = [Judgement.of(case) for case in cases]
     unseen = [j for j in judged if j.name == UNSEEN]
-    limits = {m: max(j.spread[m] for j in unseen) for m in MEASURES}
+    limits = limits_of(unseen)
     print_cases(judged, limits)
     print_correlations(judged, limits)
-    alarms = sum(
-        j.marked({m: max(o.spread[m] for o in unseen if o is not j) for m in MEASURES})
-        for j in unseen
-    )
+    alarms = sum(j.marked(limits_of([o for o in unseen if o is not j])) for j in unseen)
     print(f"By limits from the others, {alarms} of {len(unseen)} unseen layouts would be marked")
-    print("Limits: the largest spread over the unseen layouts, " + json.dumps(limits))
+    print(
+        "Limits, mean and three standard deviations of the spread over the unseen layouts: "
+        + ", ".join(f"{m} {100 * v:.2f} %" for m, v in limits.items())
+    )
     if arguments.write is not None:
         write(arguments.write, [s.name for s in specs[1:]], limits)
+
+
+def limits_of(unseen: Sequence[Judgement]) -> dict[str, float]:
+    """Spread that is usual at most: the mean over unseen layouts and three deviations."""
+    values = {m: np.array([j.spread[m] for j in unseen]) for m in MEASURES}
+    return {m: float(v.mean() + 3 * v.std(ddof=1)) for m, v in values.items()}
 
 
 def print_cases(judged: Sequence[Judgement], limits: dict[str, float]) -> None:
@@ -137,11 +143,12 @@ def print_cases(judged: Sequence[Judgement], limits: dict[str, float]) -> None:
             )
             row.append(f"{100 * spread:.2f} / {100 * error:.2f}" if spread == spread else "-")
         row.append(f"{marked} of {len(group)}")
-        row.append("; ".join(sorted({line.split(" = ")[0] for j in group for line in j.broken})))
+        broken = {line.split(" = ")[0].split()[-1] for j in group for line in j.broken}
+        row.append(", ".join(sorted(broken)))
         rows.append(row)
     print_table(
         "Spread / error in %, of values relative to no baffles",
-        ["scene", *MEASURES, "marked", "limits of the card"],
+        ["scene", *MEASURES, "marked", "beyond the limits of"],
         rows,
     )
 
