@@ -9,6 +9,7 @@ import numpy as np
 
 from design import page
 from design.results import RunResults
+from gns_model import footprint
 from gns_model.scene import Scene
 
 #: Pixels of the drawing's longer side, and room for the ticks around it.
@@ -40,12 +41,22 @@ class Paper:
             f"{attributes}/>"
         )
 
+    def baffles(self, scene: Scene, attributes: str) -> list[str]:
+        """The baffles of a scene as SVG shapes: polygons in plan, rectangles in elevation."""
+        if scene.dim == 2:
+            return [self.rectangle(low, high, attributes) for low, high in self.boxes(scene)]
+        shapes = []
+        for corners in scene.footprints():
+            points = " ".join("{:.1f},{:.1f}".format(*self.at(corner)) for corner in corners)
+            shapes.append(f'<polygon points="{points}" stroke-linejoin="round" {attributes}/>')
+        return shapes
+
     def at(self, point: Plane) -> tuple[float, float]:
         """Pixels of a point in metres."""
         return (point[0] - self.low[0]) * self.scale, (self.high[1] - point[1]) * self.scale
 
     def boxes(self, scene: Scene) -> np.ndarray:
-        """Baffles in the two axes shown [m], shape (B, 2, 2)."""
+        """The boxes that hold the baffles, in the two axes shown [m], shape (B, 2, 2)."""
         return scene.baffle_boxes()[:, :, list(self.axes)]
 
 
@@ -64,11 +75,10 @@ def layout_drawing(scene: Scene, best: Scene, own: Scene | None) -> str:
     parts += _arrow(paper)
     parts += _placement(paper)
     parts += _section(paper)
-    for low, high in paper.boxes(own) if own is not None else ():
-        parts.append(paper.rectangle(low, high, 'class="own"'))
+    parts += paper.baffles(own, 'class="own"') if own is not None else []
+    parts += paper.baffles(best, 'class="best"')
     for number, (low, high) in enumerate(paper.boxes(best), start=1):
         x, y = paper.at((low + high) / 2)
-        parts.append(paper.rectangle(low, high, 'class="best" rx="1.5"'))
         parts.append(f'<text x="{x:.1f}" y="{y:.1f}" dy="0.36em" class="number">{number}</text>')
     parts += _ticks(paper)
     title = f"{'Plan' if scene.dim == 3 else 'Elevation'} of the layout in {scene.name}"
@@ -87,7 +97,7 @@ def thumbnail(scene: Scene, layout: Scene, kind: str) -> str:
     for release in scene.releases:
         low, high = [[c[0], c[second]] for c in (release.lower, release.upper)]
         parts.append(paper.rectangle(low, high, 'class="release"'))
-    parts += [paper.rectangle(lo, hi, f'class="{kind}"') for lo, hi in paper.boxes(layout)]
+    parts += paper.baffles(layout, f'class="{kind}"')
     return (
         f'<svg class="thumb" viewBox="-1 -1 {paper.width + 2:.0f} {paper.height + 2:.0f}" '
         f'aria-hidden="true">{"".join(parts)}</svg>'
@@ -102,10 +112,16 @@ def coordinates(run: RunResults, placed: Scene) -> str:
         [f'<span class="key">{k}</span>', *(f"{c:.3f}" for c in baffle.center)]
         for k, baffle in enumerate(placed.baffles, start=1)
     ]
-    size = placed.baffles[0].size
+    size, yaw = placed.baffles[0].size, placed.baffles[0].yaw
     text = f"{size[0]:g} m along x, {size[1]:g} m high" + (
         "" if plane else f", {size[2]:g} m across"
     )
+    if len({baffle.yaw for baffle in placed.baffles}) > 1:
+        head.append("yaw [°]")
+        rows = [[*row, f"{b.yaw:.1f}"] for row, b in zip(rows, placed.baffles, strict=True)]
+        text += "; a yaw turns from x towards z"
+    elif yaw:
+        text += f", turned by {yaw:.1f}° from x towards z"
     volume = float(np.prod([b.size for b in placed.baffles], axis=1).sum())
     unit = "m² (per metre of width)" if plane else "m³"
     gaps = _least_gap(placed)
@@ -124,13 +140,13 @@ def _links(run: RunResults) -> str:
 
 def _least_gap(scene: Scene) -> float | None:
     """Smallest clear distance between two footprints [m]."""
-    plan = scene.baffle_boxes()[:, :, [0, *range(2, scene.dim)]]
-    gaps = [
-        float(np.linalg.norm(np.maximum(np.maximum(a[0] - b[1], b[0] - a[1]), 0)))
-        for k, a in enumerate(plan)
-        for b in plan[:k]
-    ]
-    return min(gaps) if gaps else None
+    if scene.dim == 2:
+        spans = np.sort(scene.baffle_boxes()[:, :, 0], axis=0)
+        return float((spans[1:, 0] - spans[:-1, 1]).min()) if len(spans) > 1 else None
+    plan = scene.footprints()
+    first, second = np.triu_indices(len(plan), 1)
+    gaps = np.maximum(footprint.separation(plan[first], plan[second]), 0.0)
+    return float(gaps.min()) if len(gaps) else None
 
 
 def legend(scene: Scene) -> str:

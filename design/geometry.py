@@ -61,8 +61,7 @@ def baffle_mesh(scene: Scene) -> trimesh.Trimesh:
     """
     if not scene.baffles:
         raise ValueError("the scene has no baffles to draw")
-    boxes = [_box(*corners) for corners in _in_3d(scene.baffle_boxes())]
-    mesh: trimesh.Trimesh = trimesh.util.concatenate(boxes)  # type: ignore[assignment]
+    mesh: trimesh.Trimesh = trimesh.util.concatenate(_baffles(scene))  # type: ignore[assignment]
     return mesh
 
 
@@ -76,8 +75,8 @@ def scene_graph(scene: Scene) -> trimesh.Scene:
     for k, release in enumerate(scene.releases, start=1):
         corners = _in_3d(np.array([[release.lower, release.upper]]))[0]
         _add(graph, _box(*corners), f"release-{k}", RELEASE_COLOUR)
-    for k, corners in enumerate(_in_3d(scene.baffle_boxes()), start=1):
-        _add(graph, _box(*corners), f"baffle-{k}", BAFFLE_COLOUR)
+    for k, baffle in enumerate(_baffles(scene), start=1):
+        _add(graph, baffle, f"baffle-{k}", BAFFLE_COLOUR)
     return graph
 
 
@@ -90,6 +89,20 @@ def stl_bytes(mesh: trimesh.Trimesh, name: str) -> bytes:
     # The first 80 bytes are free text; "solid" at their start would make readers expect ASCII.
     header = f"baffles of {name}; metres; z up".encode("ascii", "replace")[:80]
     return struct.pack("80s", header) + content.getvalue()[80:]
+
+
+def _baffles(scene: Scene) -> list[trimesh.Trimesh]:
+    """Each baffle as a closed box, turned by its yaw, in the scene's frame [m]."""
+    boxes, turns = scene.oriented_boxes()
+    meshes = []
+    for corners, (cosine, sine) in zip(_in_3d(boxes), turns, strict=True):
+        mesh = _box(*corners)
+        if sine:
+            middle = corners.mean(axis=0)
+            turn = np.array([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]])
+            mesh.vertices = (mesh.vertices - middle) @ turn.T + middle
+        meshes.append(mesh)
+    return meshes
 
 
 def _in_3d(boxes: np.ndarray) -> np.ndarray:

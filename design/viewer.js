@@ -113,19 +113,34 @@
 
       // Boxes from back to front. A grain is in front of a box if it lies beyond one of the faces
       // that we see: exact for convex boxes that no grain is inside of.
+      // A box is turned about the vertical through its middle: `own` sees a point in the frame in
+      // which it is not.
       const boxes = flow.baffles
-        .map(([low, high]) => ({ low, high, far: depth(...low.map((l, a) => (l + high[a]) / 2)) }))
+        .map(([low, high, [cosine, sine]]) => {
+          const mid = low.map((l, a) => (l + high[a]) / 2);
+          const turn = (q, s) => {
+            const x = q[0] - mid[0], z = q[2] - mid[2];
+            return [mid[0] + cosine * x - s * z, q[1], mid[2] + s * x + cosine * z];
+          };
+          return {
+            low, high, far: depth(...mid),
+            own: (q) => (sine ? turn(q, -sine) : q),
+            world: (q) => (sine ? turn(q, sine) : q),
+            normal: [depth(cosine, 0, sine), depth(0, 1, 0), depth(-sine, 0, cosine)],
+          };
+        })
         .sort((a, b) => a.far - b.far);
-      const normal = [depth(1, 0, 0), depth(0, 1, 0), depth(0, 0, 1)];
       const n = flow.grains, offset = frame * n;
       const layer = new Uint8Array(n), far = new Float32Array(n);
       for (let i = 0; i < n; i++) {
         const q = 3 * (offset + i);
         far[i] = depth(flow.p[q], flow.p[q + 1], flow.p[q + 2]);
+        const grain = [flow.p[q], flow.p[q + 1], flow.p[q + 2]];
         boxes.forEach((box, b) => {
+          const seen = box.own(grain);
           for (let a = 0; a < 3; a++) {
-            const v = flow.p[q + a];
-            if ((normal[a] > 1e-6 && v >= box.high[a]) || (normal[a] < -1e-6 && v <= box.low[a])) {
+            const v = seen[a], toward = box.normal[a];
+            if ((toward > 1e-6 && v >= box.high[a]) || (toward < -1e-6 && v <= box.low[a])) {
               layer[i] = b + 1;
             }
           }
@@ -153,7 +168,7 @@
         if (b < boxes.length) solid(boxes[b], flow.colour);
       }
 
-      function solid({ low, high }, colour) {
+      function solid({ low, high, normal, world }, colour) {
         const paint = rgb(css(colour)), dark = [0, 0, 0], light = [255, 255, 255];
         const shade = [mix(paint, dark, 0.22), mix(paint, light, 0.22), mix(paint, dark, 0.06)];
         for (let a = 0; a < 3; a++) {
@@ -162,7 +177,7 @@
           const corner = (p, q) => {
             const r = [0, 0, 0];
             r[a] = at; r[u] = p; r[v] = q;
-            return r;
+            return world(r);
           };
           polygon([corner(low[u], low[v]), corner(high[u], low[v]),
                    corner(high[u], high[v]), corner(low[u], high[v])], shade[a], shade[a]);

@@ -125,21 +125,22 @@ def _flow(flow: Trajectory, times: np.ndarray, key: str) -> dict[str, Any]:
         "grains": len(chosen),
         "positions": base64.b64encode(packed.tobytes()).decode("ascii"),
         "size": round(volume ** (1 / flow.scene.dim), 5),
-        "baffles": [[_in_3d(c).tolist() for c in box] for box in _boxes(flow.scene)],
+        "baffles": _boxes(flow.scene),
         "colour": _COLOURS.get(key, "--best"),
         "numbers": _numbers(flow, frames),
     }
 
 
-def _boxes(scene: Scene) -> list[np.ndarray]:
-    """Corners of the baffles (2, 3) [m]; in 2D they reach a little to both sides of z = 0."""
-    boxes = []
-    for box in scene.baffle_boxes():
+def _boxes(scene: Scene) -> list[list[list[float]]]:
+    """Lower and upper corner of each baffle as it would stand unturned [m], cosine and sine of its
+    yaw; in 2D baffles reach a little to both sides of z = 0."""
+    packed = []
+    for box, turn in zip(*scene.oriented_boxes(), strict=True):
         corners = _in_3d(box)
         if scene.dim == 2:
             corners[:, 2] = -1e-3, 1e-3
-        boxes.append(corners)
-    return boxes
+        packed.append([*corners.tolist(), turn.tolist()])
+    return packed
 
 
 def _numbers(flow: Trajectory, frames: list[int]) -> dict[str, list[str]]:

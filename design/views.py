@@ -9,11 +9,12 @@ which a scatter of points does not.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.image import AxesImage
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Polygon, Rectangle
 from matplotlib.ticker import MultipleLocator
 from scipy.ndimage import gaussian_filter
 
@@ -101,8 +102,8 @@ def as_image(shown: Map) -> np.ndarray:
 def draw_plan(axes: Axes, scene: Scene, theme: Theme, colour: str, *, ticks: float = 0.6) -> None:
     """Frame and baffles of a 3D scene in plan, x to the right and z upwards."""
     lower, upper = scene.domain.lower, scene.domain.upper
-    for low, high in scene.baffle_boxes():
-        _rectangle(axes, (low[0], low[2]), (high[0], high[2]), theme, colour)
+    for corners in scene.footprints():
+        axes.add_patch(Polygon(corners, **_block(theme, colour)))
     axes.axvline(scene.control_section, color=theme.muted, lw=0.8, ls=(0, (1, 2)))
     _frame(axes, (lower[0], upper[0]), (lower[2], upper[2]), ticks)
 
@@ -113,7 +114,8 @@ def draw_side(axes: Axes, scene: Scene, theme: Theme, colour: str, *, ticks: flo
     # In 3D baffles stand at different depths of the view: let the flow shine through.
     alpha = 0.45 if scene.dim == 3 else 1.0
     for low, high in scene.baffle_boxes():
-        _rectangle(axes, low[:2], high[:2], theme, colour, alpha=alpha)
+        style = _block(theme, colour, alpha)
+        axes.add_patch(Rectangle(tuple(low[:2]), *(high - low)[:2], **style))
     axes.axvline(scene.control_section, color=theme.muted, lw=0.8, ls=(0, (1, 2)))
     _frame(axes, (lower[0], upper[0]), (lower[1], side_top(scene)), ticks)
 
@@ -124,19 +126,14 @@ def side_top(scene: Scene) -> float:
     return min(scene.domain.upper[1], scene.base + 1.45 * (tallest - scene.base))
 
 
-def _rectangle(axes: Axes, low, high, theme: Theme, colour: str, alpha: float = 1.0) -> None:
-    axes.add_patch(
-        Rectangle(
-            tuple(low),
-            high[0] - low[0],
-            high[1] - low[1],
-            facecolor=colour,
-            edgecolor=theme.paper,
-            linewidth=0.8,
-            alpha=alpha,
-            zorder=3,
-        )
-    )
+def _block(theme: Theme, colour: str, alpha: float = 1.0) -> dict[str, Any]:
+    return {
+        "facecolor": colour,
+        "edgecolor": theme.paper,
+        "linewidth": 0.8,
+        "alpha": alpha,
+        "zorder": 3,
+    }
 
 
 def _frame(axes: Axes, x: tuple[float, float], y: tuple[float, float], ticks: float) -> None:

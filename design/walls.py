@@ -1,10 +1,11 @@
 """Walls as somebody drew them: a closed mesh (STL, PLY, OBJ, OFF, GLB) as baffles of a scene.
 
-Every connected body of the mesh has to be a box along the axes that stands on the base: that is
-what both simulators know exactly. Anything else is refused, since a bounding box in its place would
-be another wall than the one that was drawn. Coordinates are metres with the scene's origin. STL,
-PLY, OBJ and OFF are read with z up, as CAD programs and our own STL have it, and GLB with y up, as
-its standard says (design/geometry.py tells how the two frames relate).
+Every connected body of the mesh has to be a box that stands upright on the base, along the axes or
+turned about the vertical: that is what both simulators know exactly. Anything else is refused,
+since a bounding box in its place would be another wall than the one that was drawn. Coordinates are
+metres with the scene's origin. STL, PLY, OBJ and OFF are read with z up, as CAD programs and our
+own STL have it, and GLB with y up, as its standard says (design/geometry.py tells how the two
+frames relate).
 """
 
 from __future__ import annotations
@@ -16,9 +17,11 @@ from typing import Literal
 
 import numpy as np
 import trimesh
+from scipy.spatial import ConvexHull, QhullError
 
 from design.geometry import Y_UP_TO_Z_UP
 from gns_model.errors import FileFormatError, GnsError
+from gns_model.footprint import bounding_size, turn
 from gns_model.scene import Baffle, Scene
 
 Axis = Literal["y", "z"]
@@ -26,12 +29,16 @@ Axis = Literal["y", "z"]
 #: Which axis is up in a file of this kind.
 UP: dict[str, Axis] = {".stl": "z", ".ply": "z", ".obj": "z", ".off": "z", ".glb": "y"}
 
-#: A body is a box if it fills its bounding box but for this share of its volume.
+#: A body is a box if it fills the least upright box around it but for this share of its volume.
 BOX_SHARE = 0.01
 #: How far above or below the base a body may end and still stand on it [m].
 FOOT = 1e-3
 #: Coordinates are rounded to this [m], so that an STL's single precision is not taken for meant.
 ROUNDING = 1e-6
+#: As are yaws to this [degrees].
+YAW_ROUNDING = 1e-3
+#: A yaw that moves no corner by more than this is not taken for meant, either [m].
+TRACE = 2e-5
 
 
 class WallError(GnsError, ValueError):
@@ -146,11 +153,13 @@ def _baffle(name: str, body: trimesh.Trimesh, scene: Scene) -> Baffle:
             f"{name} spans {span} (x downstream, y up, z across) and leaves the domain "
             f"{_point(low)} to {_point(high)}: are its units metres, and is its upward axis --up?"
         )
-    filled = abs(float(body.volume)) / float(size.prod())
+    middle, sides, yaw = _least_rectangle(np.asarray(body.vertices)[:, [0, 2]])
+    area = float(sides.prod()) if scene.dim == 3 and yaw else float(size[0] * size[2])
+    filled = abs(float(body.volume)) / (area * float(size[1]))
     if filled < 1 - BOX_SHARE:
         raise WallError(
-            f"{name} is no box along the axes (it fills {100 * filled:.1f}% of the box {span}): "
-            "only such boxes are simulated exactly; draw it as several of them"
+            f"{name} is no upright box (it fills {100 * filled:.1f}% of the least one around it, "
+            f"{span}): only such boxes are simulated exactly; draw it as several of them"
         )
     if abs(lower[1] - scene.base) > FOOT:
         where = "above" if lower[1] > scene.base else "below"
@@ -159,6 +168,18 @@ def _baffle(name: str, body: trimesh.Trimesh, scene: Scene) -> Baffle:
             f"{where} it, at y = {lower[1]:g} m"
         )
     # What reaches a wall within FOOT is meant to reach it.
+    if scene.dim == 3 and yaw:
+        sides = np.round(sides / ROUNDING) * ROUNDING
+        reach, across = bounding_size(sides, yaw) / 2, [0, 2]
+        middle = np.clip(
+            np.round(middle / ROUNDING) * ROUNDING, low[across] + reach, high[across] - reach
+        )
+        top = min(float(upper[1]), float(high[1]))
+        return Baffle(
+            center=tuple(map(float, middle)),
+            size=(float(sides[0]), round(top - scene.base, 7), float(sides[1])),
+            yaw=yaw,
+        )
     lower, upper = np.maximum(lower, low), np.minimum(upper, high)
     plan = [0, *range(2, scene.dim)]
     edges = [upper[0] - lower[0], upper[1] - scene.base, *(upper - lower)[2:]]
@@ -166,6 +187,35 @@ def _baffle(name: str, body: trimesh.Trimesh, scene: Scene) -> Baffle:
         center=tuple(round(float(c), 7) for c in (lower + upper)[plan] / 2),
         size=tuple(round(float(s), 7) for s in edges),
     )
+
+
+def _least_rectangle(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """The least rectangle around points in plan (N, 2): middle, sides (2,) [m] and yaw [degrees].
+
+    One of its sides lies along a side of the convex hull. Of the ways to write it the one with a
+    yaw in (-45, 45] is taken.
+    """
+    try:
+        hull = points[ConvexHull(points).vertices]
+    except QhullError:  # all in a line
+        return points.mean(axis=0), np.zeros(2), 0.0
+    sides = np.roll(hull, -1, axis=0) - hull
+    yaws = np.degrees(np.arctan2(sides[:, 1], sides[:, 0]))
+    yaws = np.round(yaws / YAW_ROUNDING) * YAW_ROUNDING
+    yaws = np.unique(np.append(45 - (45 - yaws) % 90, 0.0))
+    best = None
+    for yaw in sorted(yaws, key=abs):  # of equal ones the straightest
+        cosine, sine = turn(float(yaw))
+        seen = hull @ np.array([[cosine, -sine], [sine, cosine]])
+        low, high = seen.min(axis=0), seen.max(axis=0)
+        if best is None or (high - low).prod() < best[0] * (1 - 1e-6):
+            middle = (low + high) / 2 @ np.array([[cosine, sine], [-sine, cosine]])
+            best = float((high - low).prod()), middle, high - low, round(float(yaw), 3)
+    assert best is not None
+    _, middle, extent, yaw = best
+    if np.hypot(*extent) / 2 * abs(np.radians(yaw)) < TRACE:
+        return (points.min(axis=0) + points.max(axis=0)) / 2, np.ptp(points, axis=0), 0.0
+    return middle, extent, yaw
 
 
 def _point(corner: np.ndarray) -> str:

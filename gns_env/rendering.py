@@ -15,7 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, to_rgba
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Polygon, Rectangle
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
@@ -100,8 +100,8 @@ class PlanView:
             vmax=0.8 * top,
             interpolation="bicubic",
         )
-        for low, high in scene.baffle_boxes():
-            axes.add_patch(_box(low[[0, 2]], high[[0, 2]]))
+        for corners in scene.footprints():
+            axes.add_patch(_block(corners))
         for r in scene.releases:
             corner, size = (r.lower[0], r.lower[2]), (r.size[0], r.size[2])
             axes.add_patch(Rectangle(corner, *size, fill=False, ec=MUTED, lw=0.8, ls=(0, (3, 2))))
@@ -151,7 +151,7 @@ class SideView:
         self.positions = self.positions[:, order]
         # In 3D baffles stand at different depths of the view: the flow is drawn over pale ones.
         for low, high in scene.baffle_boxes():
-            axes.add_patch(_box(low[:2], high[:2], pale=scene.dim == 3))
+            axes.add_patch(_block(_around(low[:2], high[:2]), pale=scene.dim == 3))
         self.points = axes.scatter(
             self.positions[0, :, 0],
             self.positions[0, :, 1],
@@ -255,11 +255,15 @@ def _side_top(scene: Scene) -> float:
     return float(min(scene.domain.upper[1], scene.base + 1.3 * (max(heights) - scene.base)))
 
 
-def _box(low: NDArray[np.float64], high: NDArray[np.float64], pale: bool = False) -> Rectangle:
+def _around(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Corners (4, 2) of a rectangle along the axes, in order around it."""
+    return np.array([low, (high[0], low[1]), high, (low[0], high[1])])
+
+
+def _block(corners: NDArray[np.float64], pale: bool = False) -> Polygon:
     colours = (to_rgba(BAFFLE, 0.28), BAFFLE) if pale else (BAFFLE, "white")
-    return Rectangle(
-        (low[0], low[1]),
-        *(high - low),
+    return Polygon(
+        corners,
         facecolor=colours[0],
         edgecolor=colours[1],
         lw=0.8,

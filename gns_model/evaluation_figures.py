@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Polygon
 
 from gns_model.evaluation import CELL, JUDGED, Comparison
 from gns_model.measures import UNITS
@@ -105,11 +105,8 @@ def _plan(
         vmax=high,
         interpolation="nearest",
     )
-    for lower, upper in scene.baffle_boxes():
-        size = upper - lower
-        axes.add_patch(
-            Rectangle((lower[0], lower[2]), size[0], size[2], facecolor="0.35", edgecolor="black")
-        )
+    for corners in scene.footprints():
+        axes.add_patch(Polygon(corners, facecolor="0.35", edgecolor="black"))
     axes.axvline(scene.control_section, color="0.3", linewidth=0.8, linestyle="--")
 
 

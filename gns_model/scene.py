@@ -460,6 +460,16 @@ class Scene(_Part):
                 boxes[k] = _corners(baffle.model_copy(update={"yaw": 0.0}).box(self.base))
         return boxes, turns
 
+    def footprints(self) -> np.ndarray:
+        """Corners of the baffles in plan, in order around each [m], (x, z), shape (B, 4, 2).
+
+        Raises:
+            SceneError: in 2D.
+        """
+        if self.dim != 3:
+            raise SceneError("a 2D scene has no plan")
+        return np.array([baffle.corners for baffle in self.baffles]).reshape(-1, 4, 2)
+
     def with_baffles(
         self,
         centres: Sequence[Sequence[float]] | np.ndarray,

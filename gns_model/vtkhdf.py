@@ -126,11 +126,17 @@ def _velocity(trajectory: Trajectory, positions: np.ndarray) -> np.ndarray:
 
 def _baffles(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Corners (P, 3) [m] and faces (F, 4) of the baffles of a scene."""
-    boxes = scene.baffle_boxes()
+    boxes, turns = scene.oriented_boxes()
     unit = np.stack(np.meshgrid(*[[0, 1]] * scene.dim, indexing="ij"), -1).reshape(-1, scene.dim)
     corners = np.zeros((len(boxes), len(unit), 3))
     for k, (low, high) in enumerate(boxes):
         corners[k, :, : scene.dim] = np.where(unit == 1, high, low)
+        cosine, sine = turns[k]
+        if sine:
+            middle = (low + high)[[0, 2]] / 2
+            x, z = (corners[k][:, [0, 2]] - middle).T
+            corners[k][:, 0] = middle[0] + cosine * x - sine * z
+            corners[k][:, 2] = middle[1] + sine * x + cosine * z
     each = _FACES_3D if scene.dim == 3 else _FACES_2D
     faces = each[None] + len(unit) * np.arange(len(boxes))[:, None, None]
     return corners.reshape(-1, 3), faces.reshape(-1, 4)

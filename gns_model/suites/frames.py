@@ -7,12 +7,11 @@ from collections.abc import Mapping, Sequence
 
 import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Polygon
 
 from gns_model import measures
 from gns_model.evaluation_figures import save_figure
@@ -112,7 +111,8 @@ def plan_views(pair: Pair, times: Sequence[float], name: str, path: Path) -> Non
                 points[:, 0], points[:, 2], s=share**2, c=points[:, 1] - scene.base,
                 cmap=HEIGHTS, vmin=0.0, vmax=1.1 * top, linewidths=0,
             )  # fmt: skip
-            _baffles(axes, scene.baffle_boxes())
+            for corners in scene.footprints():
+                axes.add_patch(Polygon(corners, facecolor="0.35", edgecolor="black"))
             axes.set(
                 xlim=(scene.domain.lower[0], scene.domain.upper[0]),
                 ylim=(scene.domain.lower[2], scene.domain.upper[2]),
@@ -129,14 +129,6 @@ def plan_views(pair: Pair, times: Sequence[float], name: str, path: Path) -> Non
         shrink=0.4, aspect=40,
     )  # fmt: skip
     save_figure(figure, path)
-
-
-def _baffles(axes: Axes, boxes: np.ndarray) -> None:
-    for lower, upper in boxes:
-        size = upper - lower
-        axes.add_patch(
-            Rectangle((lower[0], lower[2]), size[0], size[2], facecolor="0.35", edgecolor="black")
-        )
 
 
 def frame_at(trajectory: Trajectory, time: float) -> int:
