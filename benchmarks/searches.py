@@ -4,11 +4,11 @@
     python benchmarks/searches.py --out runs/searches --show   # table and figure of what there is
 
 Every method gets the same number of passes in every scene, once for each seed. A pass is a rollout
-or a backward pass through one. Runs that ask for the same layouts (the baselines, random starts of
-one seed) share them, which saves time; each is counted where it was asked for. The curve of a run
-is written as soon as the run ends, and a run whose file is there is not run again, so Ctrl-C loses
-the runs under way only. The table ends with the difference between hybrid and each other method,
-seed by seed.
+or a backward pass through one. Runs that ask for the same layout (the baselines, random starts of
+one seed) share what it gave through a file, which saves time; each is counted where it was asked
+for. The curve of a run is written as soon as the run ends, a run whose file is there is not run
+again, and one that was interrupted finds what it had asked for, so Ctrl-C costs nothing. The table
+ends with the difference between hybrid and each other method, seed by seed.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ from __future__ import annotations
 import argparse
 import csv
 import io
+import json
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
@@ -63,27 +64,59 @@ parser.add_argument("--show", action="store_true", help="run nothing")
 
 
 class Remembering:
-    """An evaluator that knows the gradients it has computed, as the task's cache knows rollouts."""
+    """An evaluator that runs no layout twice: what is known is in a file that processes share.
+
+    Costs, status and gradients are remembered, which is what a search asks for.
+    """
 
     differentiable = True
 
-    def __init__(self, task: Any) -> None:
+    def __init__(self, task: Any, file: Path) -> None:
         from design.evaluators import InProcess
 
-        self._inner = InProcess(task)
-        self._known: dict[bytes, Any] = {}
+        self._inner, self._file, self._read = InProcess(task), file, 0
+        self._known: dict[str, Any] = {}
 
     def evaluate(self, layouts: Sequence[np.ndarray]) -> Iterator[tuple[int, Any]]:
         """See `design.campaign.Evaluator`."""
-        yield from self._inner.evaluate(layouts)
+        yield from self._each("cost", self._inner.evaluate, layouts)
 
     def differentiate(self, layouts: Sequence[np.ndarray]) -> Iterator[tuple[int, Any]]:
         """See `design.campaign.Evaluator`."""
+        yield from self._each("gradient", self._inner.differentiate, layouts)
+
+    def _each(
+        self, kind: str, run: Callable[..., Any], layouts: Sequence[np.ndarray]
+    ) -> Iterator[tuple[int, Any]]:
+        from design.trials import Outcome
+
         for k, layout in enumerate(layouts):
-            key = np.round(layout, 7).tobytes()
-            if key not in self._known:
-                self._known[key] = next(iter(self._inner.differentiate([layout])))[1]
-            yield k, self._known[key]
+            name = f"{kind} {np.round(layout, 6).tolist()}"
+            if name not in self._known:
+                self._look()
+            if name not in self._known:
+                outcome = next(iter(run([layout])))[1]
+                gradient = None if outcome.gradient is None else outcome.gradient.tolist()
+                values = [outcome.cost, outcome.status, outcome.backwards, gradient]
+                with self._file.open("a", encoding="utf-8") as stream:
+                    stream.write(json.dumps([name, *values]) + "\n")
+                self._known[name] = values
+            cost, status, backwards, gradient = self._known[name]
+            slope = None if gradient is None else np.array(gradient)
+            yield k, Outcome(cost, {}, status, backwards=backwards, gradient=slope)
+
+    def _look(self) -> None:
+        """Read what was written since the last look."""
+        if not self._file.exists():
+            return
+        with self._file.open(encoding="utf-8") as stream:
+            stream.seek(self._read)
+            for line in iter(stream.readline, ""):
+                if not line.endswith("\n"):
+                    break  # another process is writing it
+                name, *values = json.loads(line)
+                self._known[name] = values
+                self._read = stream.tell()
 
 
 def run_file(out: Path, scene: str, method: str, seed: int) -> Path:
@@ -109,7 +142,7 @@ def run_all(arguments: argparse.Namespace, scene: str, seed: int) -> list[str]:
         arguments.simulator,
         n_baffles=len(given.baffles),
     )
-    evaluator = Remembering(task)
+    evaluator = Remembering(task, arguments.out / f"{Path(scene).stem}.jsonl")
     lines = []
     for method in arguments.methods:
         file = run_file(arguments.out, scene, method, seed)
@@ -140,9 +173,24 @@ def run_all(arguments: argparse.Namespace, scene: str, seed: int) -> list[str]:
     return lines
 
 
+def same_settings(arguments: argparse.Namespace) -> None:
+    """Write down what the runs in --out have in common, or refuse to add others to them."""
+    from gns_model.scene import write_whole
+
+    names = ("budget", "batch", "duration", "simulator")
+    settings = {name: getattr(arguments, name) for name in names}
+    file = arguments.out / "settings.json"
+    if not file.exists():
+        write_whole(file, json.dumps(settings).encode())
+    known = json.loads(file.read_text(encoding="utf-8"))
+    if known != settings:
+        sys.exit(f"the runs in {arguments.out} have {known}, asked for now: {settings}")
+
+
 def run_missing(arguments: argparse.Namespace) -> None:
     """All runs whose files are not there, seed by seed, so that what is there compares methods."""
     arguments.out.mkdir(parents=True, exist_ok=True)
+    same_settings(arguments)
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     work = [
         (scene, seed)

@@ -32,10 +32,13 @@ MOST_PROCESS_TRIALS = 150
 GENERATIONS, MOST_POPULATION = 5, 50
 
 
-def search(campaign: Campaign, until: int | None = None) -> None:
-    """Baselines first, then batches of the sampler that suits the budget, to its end or `until`."""
+def search(campaign: Campaign, until: int | None = None, startup: int | None = None) -> None:
+    """Baselines first, then batches of the sampler that suits the budget, to its end or `until`.
+
+    `startup`: trials before its model takes over; default: as `sampler`.
+    """
     few = campaign.passes <= MOST_PROCESS_TRIALS
-    _search(campaign, "gp" if few else "tpe", "bayes", until)
+    _search(campaign, "gp" if few else "tpe", "bayes", until, startup)
 
 
 def tpe(campaign: Campaign) -> None:
@@ -53,13 +56,19 @@ def nsga2(campaign: Campaign) -> None:
     _search(campaign, "nsga2")
 
 
-def _search(campaign: Campaign, kind: str, origin: str = "", until: int | None = None) -> None:
+def _search(
+    campaign: Campaign,
+    kind: str,
+    origin: str = "",
+    until: int | None = None,
+    startup: int | None = None,
+) -> None:
     """`origin`: what its trials are called; default: the kind of sampler."""
     enqueue_baselines(campaign)
     goal = campaign.passes if until is None else min(until, campaign.passes)
     while (left := goal - campaign.spent()) > 0:
         count = min(campaign.batch, left)
-        campaign.try_proposals(count, sampler(campaign, kind), origin or kind)
+        campaign.try_proposals(count, sampler(campaign, kind, startup), origin or kind)
 
 
 def enqueue_baselines(campaign: Campaign) -> None:
@@ -68,15 +77,21 @@ def enqueue_baselines(campaign: Campaign) -> None:
         campaign.log.enqueue(origin, centres)
 
 
-def sampler(campaign: Campaign, kind: str) -> optuna.samplers.BaseSampler:
+def sampler(
+    campaign: Campaign, kind: str, startup: int | None = None
+) -> optuna.samplers.BaseSampler:
     """The sampler "tpe", "gp" or "nsga2" of the next batch.
 
     Made anew for each batch, so that resuming changes nothing.
+
+    Args:
+        startup: trials before a model takes over; until then layouts are random.
     """
     rng = campaign.rng()
     seed = int(rng.integers(2**31))
     # A model that knows little is better than no model: chance has half of the budget at most.
-    startup = min(max(LEAST_STARTUP, 2 * campaign.space.dim), max(campaign.passes // 2, 1))
+    if startup is None:
+        startup = min(max(LEAST_STARTUP, 2 * campaign.space.dim), max(campaign.passes // 2, 1))
     model: optuna.samplers.BaseSampler
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)

@@ -13,8 +13,9 @@ from design.trials import Outcome
 from gns_env.layout import LayoutSpace
 from gns_model.trajectory import OK
 
-#: First step of a chain [m], a fifth of the paper's baffle: the most that a coordinate moves.
-STEP = 0.03
+#: First step of a chain [m], a third of the paper's baffle: the most that a coordinate moves.
+#: A fifth of it leaves a search of twenty passes on its way.
+STEP = 0.05
 #: Steps shorter than this end a chain [m]: less than anybody builds to.
 LEAST_STEP = 0.003
 #: A chain ends where the next move, within the constraints, is below this share of its step.
