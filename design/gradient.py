@@ -25,7 +25,7 @@ from design.trials import Outcome
 from gns_env.task import BaffleTask
 from gns_model import measures as hard
 from gns_model.errors import SimulatorError
-from gns_model.learned.rollout import ADJOINT_LIMIT
+from gns_model.learned.adjoint import ADJOINT_LIMIT, ADJOINT_SMOOTHING
 from gns_model.particles import MOVING
 from gns_model.scene import Scene
 from gns_model.trajectory import DIVERGED, OK, Trajectory
@@ -101,15 +101,22 @@ def descend(
 
 
 def cost_and_gradient(
-    task: BaffleTask, layout: ArrayLike, *, limit: float | None = ADJOINT_LIMIT
+    task: BaffleTask,
+    layout: ArrayLike,
+    *,
+    limit: float | None = ADJOINT_LIMIT,
+    smoothing: float = ADJOINT_SMOOTHING,
+    starts: int = 1,
 ) -> tuple[float, np.ndarray]:
-    """The smooth cost of a layout and its derivative, by one rollout and one backward pass.
+    """The smooth cost of a layout and its derivative, by one rollout and one backward pass a start.
 
     Args:
         task: with a simulator that has a gradient; of several objectives the sum counts.
         layout: centres [m], shape (n, D-1), in any order.
-        limit: of a grain's adjoint, in medians (`gns_model.learned.rollout.LimitAdjoint`), which
-            keeps the gradient of a long flow useful; None: the exact derivative.
+        limit, smoothing: of the grains' adjoints (`gns_model.learned.adjoint`), which keep the
+            gradient of a long flow right; None and 0: the exact derivative.
+        starts: average over that many starts of the flow that differ in single grains
+            (`LearnedSimulator.perturbed_start`), the usual one first.
 
     Returns:
         the cost of the smooth measures, relative to no baffles, and d cost / d layout [1/m], shape
@@ -124,9 +131,11 @@ def cost_and_gradient(
     if not hasattr(task.simulator, "rollout_tensor"):
         raise SimulatorError(f"the simulator {task.simulator.name!r} has no gradient")
     centres = torch.tensor(task.space.as_centres(layout).copy(), requires_grad=True)
-    _, costs = smooth_costs(task, [centres], limit=limit)
-    costs.sum().backward()
-    cost = float(costs.detach().sum())
+    _, costs = smooth_costs(
+        task, [centres] * starts, limit=limit, smoothing=smoothing, draws=range(starts)
+    )
+    costs.mean().backward()
+    cost = float(costs.detach().mean())
     gradient = None if centres.grad is None else centres.grad.numpy()
     if gradient is None or not (np.isfinite(cost) and np.isfinite(gradient).all()):
         raise SimulatorError("the rollout of this layout diverged, so it has no gradient")
@@ -138,6 +147,7 @@ def smooth_costs(
     centres: Sequence[Tensor],
     *,
     limit: float | None = ADJOINT_LIMIT,
+    smoothing: float = ADJOINT_SMOOTHING,
     draws: Sequence[int] | None = None,
 ) -> tuple[list[Tensor], Tensor]:
     """Positions (T, N, D) and the smooth cost of each layout (n, D-1), shape (layouts,).
@@ -145,7 +155,7 @@ def smooth_costs(
     Args:
         task: with a simulator that has a gradient.
         centres: of each layout [m], shape (n, D-1); may require grad.
-        limit: as `cost_and_gradient`.
+        limit, smoothing: as `cost_and_gradient`.
         draws: the start of each layout (`LearnedSimulator.perturbed_start`); default: the usual.
     """
     import torch
@@ -160,8 +170,9 @@ def smooth_costs(
             simulator.perturbed_start(scene, draw)
             for scene, draw in zip(scenes, draws, strict=True)
         ]
-    more = {} if noise is None else {"noise": noise}
-    rollouts = simulator.rollout_tensor(scenes, centres, limit=limit, **more)
+    more: dict[str, Any] = {} if noise is None else {"noise": noise}
+    more |= {"limit": limit, "smoothing": smoothing}
+    rollouts = simulator.rollout_tensor(scenes, centres, **more)
     reference, size = task.reference, tuple(task.space.size)
     costs = []
     for positions, scene, c in zip(rollouts, scenes, centres, strict=True):

@@ -257,7 +257,7 @@ class _Measure:
         options = self.wanted.rollout_options(self.scene, leaf)
         scene = self.wanted.put(self.scene, value)
         # The exact gradient. The derivative by the release velocity is a difference of the adjoints
-        # of neighbouring frames, which `LimitAdjoint` destroys: on a quarter of the flume over 0.5
+        # of neighbouring frames, which limited adjoints destroy: on a quarter of the flume over 0.5
         # s the slope was 0.0772 without it, -0.0001 with its 1.5, and 0.0584 by differences.
         (track,) = simulator.rollout_tensor([scene], **options)
         squared = self.target.residuals(track).square().sum()

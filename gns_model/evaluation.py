@@ -31,7 +31,7 @@ from scipy.stats import spearmanr
 
 from gns_model import measures
 from gns_model.errors import SimulatorError
-from gns_model.learned.rollout import ADJOINT_LIMIT
+from gns_model.learned.adjoint import ADJOINT_LIMIT, ADJOINT_SMOOTHING
 from gns_model.scene import Scene, write_whole
 from gns_model.simulator import Progress, Simulator
 from gns_model.smooth_measures import TEMPERATURE, smooth_measures
@@ -360,6 +360,7 @@ def gradient_check(
     temperature: float = TEMPERATURE,
     dtype: torch.dtype | None = None,
     limit: float | None = ADJOINT_LIMIT,
+    smoothing: float = ADJOINT_SMOOTHING,
 ) -> GradientCheck:
     """Autograd through a whole rollout against central differences in every baffle coordinate.
 
@@ -372,7 +373,8 @@ def gradient_check(
         frames: frames to roll out, the start included; default: the whole duration.
         temperature: of the smooth measures [m].
         dtype: of the centres; default: that of the simulator.
-        limit: of the adjoints, as the gradient search has it; None: the exact gradient.
+        limit, smoothing: of the adjoints, as the gradient search has them; None and 0: the exact
+            gradient.
 
     Raises:
         SimulatorError: if the simulator is not differentiable or the scene has no baffle.
@@ -388,7 +390,9 @@ def gradient_check(
     start = np.array([b.center for b in scene.baffles])
     sizes = torch.tensor([b.size for b in scene.baffles], dtype=dtype, device=device)
     centres = torch.tensor(start, dtype=dtype, device=device, requires_grad=True)
-    positions = simulator.rollout_tensor([scene], [centres], frames=frames, limit=limit)[0]
+    positions = simulator.rollout_tensor(
+        [scene], [centres], frames=frames, limit=limit, smoothing=smoothing
+    )[0]
     value = smooth_measures(positions, scene, centres, sizes, temperature=temperature)[measure]
     (gradient,) = torch.autograd.grad(value, centres)
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint as rematerialise
 
 from gns_model.errors import SimulatorError
+from gns_model.learned.adjoint import FilterAdjoint
 from gns_model.learned.divergence import astray, speed_limit
 from gns_model.learned.model import LearnedModel
 from gns_model.learned.start import Start, frame_count, launched, start
@@ -79,39 +80,6 @@ def roll_out(
     return out, diverged
 
 
-#: Limit of a grain's adjoint for design gradients over a whole flow, in medians of its scene.
-#: The exact gradient's cosine with central differences is 0.26 and 0.41 on two layouts of the flume
-#: with `baffle-lite`. Limits of 1.5, 3, 6 and 10 gave 0.87, 0.84, 0.79 and 0.81 on the first; on
-#: the second, the paper's, 1.5 gave 0.13 and 6 gave 0.88.
-ADJOINT_LIMIT = 6.0
-
-
-class LimitAdjoint(torch.autograd.Function):
-    """The identity; backward, no row may exceed `limit` times the median norm of its scene's rows.
-
-    A granular flow is chaotic: over tens of steps the adjoints of a few grains grow without bound
-    and drown what all others agree on, which is what a finite move of a baffle does.
-    """
-
-    @staticmethod
-    def forward(ctx, positions: Tensor, counts: list[int], limit: float) -> Tensor:
-        """Positions (N, D) of scenes with `counts` points each."""
-        ctx.counts, ctx.limit = counts, limit
-        return positions.view_as(positions)
-
-    @staticmethod
-    def backward(ctx, adjoint: Tensor) -> tuple[Tensor, None, None]:
-        """Adjoint (N, D), row by row no longer than allowed."""
-        limited = []
-        for part in adjoint.split(ctx.counts):
-            norm = part.norm(dim=1, keepdim=True)
-            felt = norm[norm > 0]
-            if len(felt):
-                part = part * (ctx.limit * felt.median() / norm.clamp_min(1e-30)).clamp(max=1)
-            limited.append(part)
-        return torch.cat(limited), None, None
-
-
 def roll_out_tensor(
     model: LearnedModel,
     scenes: Sequence[Scene],
@@ -122,6 +90,7 @@ def roll_out_tensor(
     checkpoint: bool,
     noise: Sequence[Tensor] | None,
     limit: float | None,
+    smoothing: float,
     velocities: Sequence[Tensor] | None = None,
     tan_friction: Sequence[Tensor] | None = None,
     sizes: Sequence[Tensor] | None = None,
@@ -163,8 +132,11 @@ def roll_out_tensor(
             track.append(rematerialise(step, *past, use_reentrant=False))
         else:
             track.append(step(*past))
-        if limit is not None:
-            track[-1] = LimitAdjoint.apply(track[-1], [len(h) for h in histories], limit)
+        if limit is not None or smoothing:
+            counts = [len(h) for h in histories]
+            track[-1] = FilterAdjoint.apply(
+                track[-1], counts, world.moving, limit, smoothing, config.radius
+            )
     # Kinematic points stand still, so any frame of theirs will do for the first ones.
     first = [
         torch.cat([s.known, h[s.rows :, -1].expand(begun, -1, -1)], 1)[:-1]

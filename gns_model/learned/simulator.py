@@ -337,6 +337,7 @@ class LearnedSimulator:
         checkpoint: bool = True,
         noise: Sequence[Tensor] | None = None,
         limit: float | None = None,
+        smoothing: float = 0.0,
         velocities: Sequence[Tensor] | None = None,
         tan_friction: Sequence[Tensor] | None = None,
         sizes: Sequence[Tensor] | None = None,
@@ -354,8 +355,9 @@ class LearnedSimulator:
             checkpoint: recompute every step in the backward pass, so that memory holds positions
                 and the inside of one step only.
             noise: displacement of the starting points [m], a tensor (N, D) for each scene.
-            limit: of a grain's adjoint in every step, see `rollout.LimitAdjoint`; default: none,
-                the exact gradient, which over a whole flow says little about a finite move.
+            limit: of a grain's adjoint in every step, see `adjoint`; default: none.
+            smoothing: of the adjoints of neighbours in every step, likewise. With neither the
+                gradient is exact, which over a whole flow says little about a finite move.
             velocities: of the points at their release [m/s], a tensor (D,) or (N, D) for each
                 scene, in place of the scene's.
             tan_friction: tan of the friction angle, a tensor () or (N,) for each scene, in place of
@@ -388,6 +390,7 @@ class LearnedSimulator:
                 checkpoint=checkpoint,
                 noise=noise,
                 limit=limit,
+                smoothing=smoothing,
                 velocities=velocities,
                 tan_friction=tan_friction,
                 sizes=sizes,

@@ -78,7 +78,7 @@ def test_a_search_beats_chance(tmp_path, method):
 
 
 def test_a_leap_improves_on_what_it_starts_from(tmp_path):
-    c = campaign(tmp_path, budget=40)
+    c = campaign(tmp_path, budget=60)
     bayes.search(c, until=20)
     before = c.log.best()
     assert before.origin != "gradient"
@@ -92,6 +92,27 @@ def test_a_leap_improves_on_what_it_starts_from(tmp_path):
     later = [t.centres for t in c.log.trials() if t.origin == "gradient"][len(leapt) :]
     assert later
     assert min(distance(later[0], old) for old in leapt) >= STEP
+
+
+class _Uphill(FormulaSimulator):
+    """Its gradients point the wrong way, its rollouts are right."""
+
+    def rollout_tensor(self, scenes, centres=None, **options):
+        turned = [2 * c.detach() - c for c in centres]
+        return super().rollout_tensor(scenes, turned, **options)
+
+
+def test_leaps_that_do_not_pay_leave_the_budget_to_optuna(tmp_path):
+    passes = {}
+    for simulator in (FormulaSimulator(), _Uphill()):
+        folder = tmp_path / type(simulator).__name__
+        folder.mkdir()
+        c = campaign(folder, simulator=simulator, budget=30, batch=4)
+        hybrid.search(c)
+        passes[type(simulator)] = 2 * sum(t.outcome.backwards for t in c.log.trials())
+        assert c.log.spent() in (29, 30)
+    assert c.log.best().origin == "bayes"
+    assert passes[_Uphill] < passes[FormulaSimulator]
 
 
 def test_a_resumed_search_is_the_search_that_was_not_interrupted(tmp_path):

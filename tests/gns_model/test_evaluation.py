@@ -363,6 +363,7 @@ def test_the_gradient_of_an_untrained_net_is_checked_too(small_flume: Scene):
         frames=12,
         temperature=0.03,
         limit=None,
+        smoothing=0.0,
     )
     assert np.abs(check.autograd).max() > 1e-6
     np.testing.assert_allclose(check.autograd, check.differences, rtol=1e-3, atol=1e-7)

@@ -10,7 +10,7 @@ import torch
 from gns_model.errors import SimulatorError
 from gns_model.learned import LearnedSimulator, Limits
 from gns_model.learned import simulator as module
-from gns_model.learned.rollout import LimitAdjoint
+from gns_model.learned.adjoint import FilterAdjoint, smoothed
 from gns_model.simulator import Simulator
 from gns_model.trajectory import Trajectory
 
@@ -274,9 +274,28 @@ def test_no_grain_drowns_the_others_in_a_limited_gradient():
         [[1.0, 0.0], [0.0, 1.0], [3e6, 4e6], [0.0, 0.0], [5.0, 0.0], [50.0, 0.0]]
     )
     positions = torch.zeros(6, 2, requires_grad=True)
-    limited = LimitAdjoint.apply(positions, [4, 2], 2.0)
-    torch.testing.assert_close(limited, positions)
-    limited.backward(adjoint)
+    moving = torch.ones(6, dtype=torch.bool)
+    same = FilterAdjoint.apply(positions, [4, 2], moving, 2.0, 0.0, 0.1)
+    torch.testing.assert_close(same, positions)
+    same.backward(adjoint)
     # Scene 0: median 1, so at most 2; scene 1: median 5, so at most 10. Directions stay.
     expected = [[1.0, 0.0], [0.0, 1.0], [1.2, 1.6], [0.0, 0.0], [5.0, 0.0], [10.0, 0.0]]
     torch.testing.assert_close(positions.grad, torch.tensor(expected))
+
+
+def test_smoothing_spreads_an_adjoint_among_neighbours_and_keeps_the_sum_of_each_scene():
+    rng = np.random.default_rng(0)
+    positions = torch.tensor(rng.uniform(0, 0.2, (60, 3)), dtype=torch.float32)
+    adjoint = torch.tensor(rng.normal(size=(60, 3)), dtype=torch.float32)
+    batch = torch.repeat_interleave(torch.arange(2), 30)
+    moving = torch.ones(60, dtype=torch.bool)
+    moving[25:30] = False
+    calm = smoothed(adjoint, positions, batch, moving, 1.0, 0.08)
+    for scene in (0, 1):
+        torch.testing.assert_close(calm[batch == scene].sum(0), adjoint[batch == scene].sum(0))
+        assert calm[batch == scene].var() < 0.7 * adjoint[batch == scene].var()
+    torch.testing.assert_close(calm[25:30], adjoint[25:30])  # they stand still
+    torch.testing.assert_close(
+        smoothed(torch.ones(60, 3), positions, batch, moving, 1.0, 0.08), torch.ones(60, 3)
+    )
+    torch.testing.assert_close(smoothed(adjoint, positions, batch, moving, 0.0, 0.08), adjoint)
