@@ -9,16 +9,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import product
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from design.campaign import Campaign
+from design.space import DesignSpace, Space
 from gns_env.layout import LayoutSpace
+
+if TYPE_CHECKING:
+    from design.campaign import Campaign
 
 #: Where along the placement area a single row is tried: 0 upstream, 1 downstream.
 ROW_PLACES = (0.0, 0.33, 0.67)
 #: Upstream and downstream row of a staggered pair.
 STAGGERED_PLACES = ((0.0, 0.4), (0.2, 0.8))
+#: Most of them where the number of baffles varies, too.
+MOST_USUAL = 8
 #: Most rows one behind the other: practice builds two or three (findings/FIELD.md).
 MOST_ROWS = 3
 #: Finest grid of rows: places and spacings are divided into 2 times 2^level parts at most.
@@ -43,7 +49,7 @@ def rows_search(campaign: Campaign) -> None:
     for level in range(LAST_LEVEL + 1):
         if not campaign.left():
             return
-        grid = [("rows", centres) for centres in rows(campaign.space, level)]
+        grid = [("rows", layout) for layout in grids(campaign, level)]
         # What a budget cuts off a grid should not be one side of it.
         order = np.random.default_rng([campaign.seed, level]).permutation(len(grid))
         campaign.run([grid[k] for k in order if new(campaign, grid[k])])
@@ -52,7 +58,26 @@ def rows_search(campaign: Campaign) -> None:
 def new(campaign: Campaign, layout: tuple[str, np.ndarray]) -> bool:
     """Whether no trial is of this layout yet."""
     centres = campaign.log.buildable(layout[1])
-    return not any(np.allclose(t.centres, centres, atol=1e-4) for t in campaign.log.trials())
+    return not any(
+        t.centres.shape == centres.shape and np.allclose(t.centres, centres, atol=1e-4)
+        for t in campaign.log.trials()
+    )
+
+
+def grids(campaign: Campaign, level: int) -> list[np.ndarray]:
+    """`rows` of the campaign's space; where number or form vary, of every number, in the nominal
+    form and, a level finer, in two more, drawn at random."""
+    space = campaign.space
+    if not isinstance(space, DesignSpace):
+        return rows(space, level)
+    rng = np.random.default_rng([campaign.seed, level, 1])
+    found = []
+    for n in space.numbers:
+        drawn = rng.uniform(size=(2 * level * bool(space.names), len(space.names)))
+        for unit in (space.nominal_unit, *drawn):
+            room, form = space.at_unit(n, unit)
+            found += [space.join(centres, form) for centres in rows(room, level)]
+    return found
 
 
 def rows(space: LayoutSpace, level: int) -> list[np.ndarray]:
@@ -68,7 +93,7 @@ def rows(space: LayoutSpace, level: int) -> list[np.ndarray]:
     steps = np.linspace(0.0, 1.0, 2 * 2**level + 1)
     length = float(space.upper[0] - space.lower[0])
     plane = len(space.lower) == 1
-    counts = [(1,) * space.n_baffles] if plane else _row_counts(space.n_baffles)
+    counts = [(1,) * space.n_baffles] if plane else row_counts(space.n_baffles)
     for columns in counts:
         more = len(columns) - 1
         room = length - more * float(space.separation[0])
@@ -90,7 +115,7 @@ def rows(space: LayoutSpace, level: int) -> list[np.ndarray]:
     return list(found.values())
 
 
-def _row_counts(n: int) -> list[tuple[int, ...]]:
+def row_counts(n: int) -> list[tuple[int, ...]]:
     """How n baffles divide into one to three rows whose numbers differ by one at most."""
     divided: list[tuple[int, ...]] = []
     for count in range(1, min(n, MOST_ROWS) + 1):
@@ -127,11 +152,15 @@ def _rows_across(
             yield middle + (flat * (closest + share * (widest - closest)))[:, None]
 
 
-def engineering_layouts(space: LayoutSpace) -> Iterator[tuple[str, np.ndarray]]:
+def engineering_layouts(space: Space) -> Iterator[tuple[str, np.ndarray]]:
     """Named buildable layouts [m], shape (n, D-1), without repetitions.
 
-    In 3D single rows and staggered pairs; in 2D, where only x is free, evenly spaced series.
+    In 3D single rows and staggered pairs; in 2D, where only x is free, evenly spaced series. Where
+    the number varies, the first of each kind for every number, `MOST_USUAL` in all.
     """
+    if isinstance(space, DesignSpace):
+        yield from _usual(space)
+        return
     seen: list[np.ndarray] = []
     for name, centres in _wishes(space):
         built = np.asarray(space.project(centres), dtype=float)
@@ -141,8 +170,20 @@ def engineering_layouts(space: LayoutSpace) -> Iterator[tuple[str, np.ndarray]]:
         yield name, built
 
 
+def _usual(space: DesignSpace) -> Iterator[tuple[str, np.ndarray]]:
+    first: list[tuple[str, np.ndarray]] = []
+    rest: list[tuple[str, np.ndarray]] = []
+    for n in sorted(space.numbers, key=lambda n: abs(n - space.n_baffles)):
+        room, form = space.at_unit(n, space.nominal_unit)
+        kinds: set[str] = set()
+        for name, centres in engineering_layouts(room):
+            (rest if name in kinds else first).append((name, space.join(centres, form)))
+            kinds.add(name)
+    yield from [*first, *rest][: MOST_USUAL if len(space.numbers) > 1 else None]
+
+
 def random_layouts(
-    space: LayoutSpace, count: int, rng: np.random.Generator
+    space: Space, count: int, rng: np.random.Generator
 ) -> Iterator[tuple[str, np.ndarray]]:
     """`count` random buildable layouts [m], shape (n, D-1)."""
     for _ in range(count):

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import optuna
-from optuna.distributions import BaseDistribution
+from optuna.distributions import BaseDistribution, IntDistribution
 from optuna.trial import FrozenTrial
 
 from design.baselines import engineering_layouts
@@ -91,7 +91,8 @@ def sampler(
     seed = int(rng.integers(2**31))
     # A model that knows little is better than no model: chance has half of the budget at most.
     if startup is None:
-        startup = min(max(LEAST_STARTUP, 2 * campaign.space.dim), max(campaign.passes // 2, 1))
+        startup = max(LEAST_STARTUP, 2 * len(campaign.log.distributions))
+        startup = min(startup, max(campaign.passes // 2, 1))
     model: optuna.samplers.BaseSampler
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
@@ -133,7 +134,15 @@ class BuildableSampler(optuna.samplers.BaseSampler):
             space = self._log.space
             return dict(to_parameters(space, space.random(self._rng)))
         # NSGA-II leaves out what it mutates: that is uniform.
-        return {n: wish[n] if n in wish else self._rng.uniform() for n in self._log.distributions}
+        return {
+            name: wish[name] if name in wish else self._uniform(distribution)
+            for name, distribution in self._log.distributions.items()
+        }
+
+    def _uniform(self, distribution: BaseDistribution) -> float:
+        if isinstance(distribution, IntDistribution):
+            return int(self._rng.integers(distribution.low, distribution.high + 1))
+        return float(self._rng.uniform())
 
     def sample_independent(
         self,

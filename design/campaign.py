@@ -9,8 +9,8 @@ from typing import Protocol
 import numpy as np
 import optuna
 
+from design.space import Space
 from design.trials import Outcome, Proposal, Trial, TrialLog
-from gns_env.layout import LayoutSpace
 
 
 class Evaluator(Protocol):
@@ -59,7 +59,7 @@ class Campaign:
     price: int = 1
 
     @property
-    def space(self) -> LayoutSpace:
+    def space(self) -> Space:
         """The buildable layouts."""
         return self.log.space
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from design.space import Space
 from design.trials import Outcome
-from gns_env.layout import LayoutSpace
 from gns_model.trajectory import OK
 
 #: First step of a chain [m], a third of the paper's baffle: the most that a coordinate moves.
@@ -25,13 +25,15 @@ HELD = 0.02
 class Chain:
     """One start of a descent. `centres` [m], shape (n, D-1), is the layout to differentiate next.
 
+    Where the form varies, its columns follow (see `space`), and a step changes it too: `project`
+    takes the mean of what the rows ask for.
     A kind of chain says which way to go, by `_direction`, and what it makes of a gradient, by
     `_observe`. `patience` is how many layouts in a row may fail to improve before it goes back.
     """
 
     patience = 2
 
-    def __init__(self, space: LayoutSpace, centres: np.ndarray, step: float = STEP) -> None:
+    def __init__(self, space: Space, centres: np.ndarray, step: float = STEP) -> None:
         self._space = space
         self.centres = np.array(centres, dtype=float)
         self.step = step
@@ -48,8 +50,8 @@ class Chain:
         if usable:
             assert gradient is not None
             self._observe(gradient)
-        if usable and outcome.cost < self.best_cost:
-            self.best_cost, self._best, self._best_gradient = outcome.cost, self.centres, gradient
+        if usable and outcome.merit < self.best_cost:
+            self.best_cost, self._best, self._best_gradient = outcome.merit, self.centres, gradient
             self._misses = 0
         else:
             self._misses += 1

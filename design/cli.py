@@ -52,6 +52,57 @@ def optimize(
         Optional[int],  # noqa: UP045
         typer.Option(help="How many baffles; default: as many as the scene has, or 3."),
     ] = None,
+    number: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(
+            help="Range for the number of baffles, such as 2:6: the search chooses.",
+            show_default=False,
+        ),
+    ] = None,
+    vary: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(
+            help="Range of what the search may choose of the baffles' form, one for all: "
+            "height=0.2:0.4, along=, across= (m) or yaw= (degrees); may be given several times.",
+            show_default=False,
+        ),
+    ] = None,
+    pattern: Annotated[
+        str, typer.Option(help="free, or rows: straight rows with stagger and spacing.")
+    ] = "free",
+    max_height: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option(help="Greatest height of a baffle in m.", show_default=False),
+    ] = None,
+    max_volume: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option(help="Most concrete in all, in cubic metres.", show_default=False),
+    ] = None,
+    wall_gap: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option(help="Least distance of a baffle to the walls in m.", show_default=False),
+    ] = None,
+    max_overtopping: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option(
+            help="Most mass that may go over the baffles' tops, as a share.", show_default=False
+        ),
+    ] = None,
+    freeboard: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option(
+            help="Least height in m of the baffles' tops above the peak upstream depth; 0: it may "
+            "be as deep as they are high.",
+            show_default=False,
+        ),
+    ] = None,
+    baffle_cost: Annotated[
+        float, typer.Option(help="Cost of each baffle, in units of the objective.")
+    ] = 0.0,
+    concrete_cost: Annotated[
+        float,
+        typer.Option(help="Cost of a cubic metre of concrete, in units of the objective."),
+    ] = 0.0,
     budget: Annotated[
         Optional[int],  # noqa: UP045
         typer.Option(
@@ -181,6 +232,7 @@ def optimize(
         from design.objectives import parse
         from design.run import Settings, optimise
         from design.scenarios import scenarios_of
+        from design.variables import placement_of
 
         names = parse(objectives) if objectives is not None else ()
         settings = Settings(
@@ -200,6 +252,18 @@ def optimize(
             resume=resume,
             workers=workers,
             batch=batch,
+            pattern=pattern,
+            baffle_cost=baffle_cost,
+            concrete_cost=concrete_cost,
+            placement=placement_of(
+                vary or (),
+                number,
+                max_height=max_height,
+                max_volume=max_volume,
+                wall_gap=wall_gap,
+                max_overtopping=max_overtopping,
+                freeboard=freeboard,
+            ),
             ensemble=names_of(ensemble),
             refine=rounds_of(refine, refine_rounds),
             refine_minutes=refine_minutes,
@@ -242,6 +306,20 @@ def _show(summary: dict[str, Any], folder: Path) -> None:
             "(" + ", ".join(f"{v:.3f}" for v in c) + ")" for c in summary["best"]["layout"]
         )
         out.print(f"Layout, centres [m]: {places}", markup=False, highlight=False)
+        size = summary["best"].get("size")
+        if size:
+            turned = f", turned by {summary['best'].get('yaw', 0):.1f} degrees"
+            text = " x ".join(f"{v:.3f}" for v in size)
+            said = f"Every baffle (along, height{', across' * (len(size) == 3)}): {text} m"
+            out.print(said + turned * ("yaw" in summary["best"]), markup=False, highlight=False)
+    for c in summary.get("constraints", ()):
+        verb = "holds" if c["holds"] else "DOES NOT HOLD"
+        out.print(
+            f"{c['name']}: {c['value']:.4g} {c['unit']}, {c['relation']} {c['limit']:.4g}: {verb} "
+            f"(by {c['by']})",
+            markup=False,
+            highlight=False,
+        )
     if summary.get("front"):
         out.print(_front_table(summary["front"]))
     if summary.get("scenarios"):

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from design.evaluators import SimulatorSpec
+from design.rules import broken
 from design.store import Pending, Rolled, Watch
 from design.trials import Outcome
 from design.verify import Judged
@@ -191,7 +192,12 @@ class Panel:
             return []
         self.judge(layouts)
         first, *others = layouts
-        others.sort(key=lambda j: j.ensemble_cost if j.ensemble_cost is not None else math.inf)
+        others.sort(
+            key=lambda j: (
+                broken(j.excess),
+                j.ensemble_cost if j.ensemble_cost is not None else math.inf,
+            )
+        )
         return [first, *others[: count - 1]]
 
     def judge(self, layouts: Sequence[Judged]) -> None:

@@ -18,6 +18,8 @@ from typing import Any
 import numpy as np
 
 from design.risk import MEAN, Flow, Risk, weigh
+from design.rules import FREE, Rules
+from design.space import Space, design_space, split, varies
 from design.trials import Outcome
 from design.workers import Workers, as_completed
 from gns_env.objective import Objective
@@ -76,11 +78,21 @@ class InProcess:
     Args:
         tasks: one task, or one for each scenario, of the same simulator and layouts.
         risk: of their costs.
+        rules: prices and limits; default: the limits of the scene.
+        space: of the layouts; default: that of the first task.
     """
 
-    def __init__(self, tasks: BaffleTask | Sequence[BaffleTask], risk: Risk | None = None) -> None:
+    def __init__(
+        self,
+        tasks: BaffleTask | Sequence[BaffleTask],
+        risk: Risk | None = None,
+        rules: Rules | None = None,
+        space: Space | None = None,
+    ) -> None:
         self.tasks = [tasks] if isinstance(tasks, BaffleTask) else list(tasks)
         self.risk = risk or Risk()
+        self.rules = rules or Rules.of(self.tasks[0].scene)
+        self.space = space or space_of(self.tasks[0])
         self.differentiable = differentiable(self.tasks[0].simulator)
 
     @property
@@ -90,13 +102,15 @@ class InProcess:
 
     def evaluate(self, layouts: Sequence[np.ndarray]) -> Iterator[tuple[int, Outcome]]:
         """See `campaign.Evaluator`."""
-        yield from enumerate(run(self.tasks, layouts, self.risk))
+        yield from enumerate(run(self.tasks, layouts, self.risk, self.rules, self.space))
 
     def differentiate(self, layouts: Sequence[np.ndarray]) -> Iterator[tuple[int, Outcome]]:
         """See `campaign.Evaluator`."""
         from design.gradient import differentiate_flows
 
-        yield from enumerate(differentiate_flows(self.tasks, layouts, self.risk))
+        yield from enumerate(
+            differentiate_flows(self.tasks, layouts, self.risk, self.rules, self.space)
+        )
 
 
 @dataclass(frozen=True)
@@ -113,6 +127,7 @@ class TaskSpec:
     simulator: SimulatorSpec
     references: tuple[Path, ...]
     risk: Risk = MEAN
+    rules: Rules = FREE
 
     @classmethod
     def of(
@@ -122,17 +137,20 @@ class TaskSpec:
         objectives: Sequence[Objective],
         simulator: SimulatorSpec,
         references: Sequence[Path],
-        risk: Risk | None = None,
+        risk: Risk = MEAN,
+        rules: Rules = FREE,
     ) -> TaskSpec:
         """The spec of tasks on `scenes`."""
         texts = tuple(json.dumps(scene.to_dict()) for scene in scenes)
-        return cls(
-            texts, n_baffles, tuple(objectives), simulator, tuple(references), risk or Risk()
-        )
+        return cls(texts, n_baffles, tuple(objectives), simulator, tuple(references), risk, rules)
 
     def tasks(self) -> list[BaffleTask]:
         """The tasks; the same ones within a process."""
         return _tasks(self)
+
+    def space(self) -> Space:
+        """Of the layouts; the same one within a process."""
+        return _space(self)
 
 
 @lru_cache(maxsize=2)
@@ -145,6 +163,11 @@ def _tasks(spec: TaskSpec) -> list[BaffleTask]:
         BaffleTask(scene, simulator, n_baffles=spec.n_baffles, objective=spec.objectives)
         for scene in scenes
     ]
+
+
+@lru_cache(maxsize=2)
+def _space(spec: TaskSpec) -> Space:
+    return space_of(spec.tasks()[0])
 
 
 class KnownReference:
@@ -203,12 +226,32 @@ class InWorkers:
             yield k, jobs[k].result()
 
 
+def space_of(task: BaffleTask) -> Space:
+    """What a search may choose in a task: places, and what its placement varies.
+
+    Raises:
+        LayoutError: if nothing fits.
+    """
+    if varies(task.space.placement):
+        return design_space(task.scene, task.space.n_baffles)
+    return task.space
+
+
 def run(
-    tasks: Sequence[BaffleTask], layouts: Sequence[np.ndarray], risk: Risk | None = None
+    tasks: Sequence[BaffleTask],
+    layouts: Sequence[np.ndarray],
+    risk: Risk | None = None,
+    rules: Rules | None = None,
+    space: Space | None = None,
 ) -> list[Outcome]:
-    """One rollout of each layout [m], shape (n, D-1), in each task, all as one batch."""
+    """One rollout of each layout [m], as `space` has them, in each task, all as one batch."""
     started = time.perf_counter()
-    asked = [(t, t.space.as_centres(layout)) for layout in layouts for t in tasks]
+    rules = rules or Rules.of(tasks[0].scene)
+    space = space or space_of(tasks[0])
+    asked = []
+    for layout in layouts:
+        centres, form = split(space, layout)
+        asked += [(t.with_form(form.size, form.yaw), centres) for t in tasks]
     found = simulate(asked)
     seconds = (time.perf_counter() - started) / max(len(layouts), 1)
     outcomes = []
@@ -216,7 +259,10 @@ def run(
         flows = []
         for (task, centres), known in zip(asked[k : k + len(tasks)], found[k:], strict=False):
             e = task.judge(centres, *known)
-            flows.append(Flow(e.status, dict(e.measures), e.costs))
+            sizes = [task.scene.baffle_size] * len(centres)
+            flows.append(
+                Flow.of(e.status, dict(e.measures), task.reference, task.objectives, rules, sizes)
+            )
         outcome = weigh(flows, risk or Risk(), failure_cost(tasks[0].objectives))
         outcomes.append(replace(outcome, seconds=seconds))
     return outcomes
@@ -228,10 +274,10 @@ def failure_cost(objectives: Sequence[Objective]) -> float:
 
 
 def _evaluate_job(spec: TaskSpec, layout: np.ndarray, slot: int) -> Outcome:
-    return run(spec.tasks(), [layout], spec.risk)[0]
+    return run(spec.tasks(), [layout], spec.risk, spec.rules, spec.space())[0]
 
 
 def _differentiate_job(spec: TaskSpec, layout: np.ndarray, slot: int) -> Outcome:
     from design.gradient import differentiate_flows
 
-    return differentiate_flows(spec.tasks(), [layout], spec.risk)[0]
+    return differentiate_flows(spec.tasks(), [layout], spec.risk, spec.rules, spec.space())[0]

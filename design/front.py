@@ -8,8 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from design.space import Space, described, form_of
 from design.trials import Trial
 from design.verify import Judged
 from gns_env.objective import Objective
@@ -21,6 +20,7 @@ def front_entries(
     parts: Sequence[Objective],
     names: Sequence[str],
     verified: Sequence[Judged],
+    space: Space,
 ) -> list[dict[str, Any]]:
     """Plain values of every point of a front, in its order.
 
@@ -37,7 +37,7 @@ def front_entries(
                 "point": k,
                 "trial": point.number,
                 "origin": point.origin,
-                "layout": np.round(point.centres, 6).tolist(),
+                **described(point.centres, form_of(space, point.centres)),
                 "file": f"layouts/{_name(k)}",
                 "cost": point.cost,
                 "objectives": relative(point.outcome.costs, parts, names),
@@ -67,7 +67,8 @@ def write_front(folder: Path, bare: Scene, entries: Sequence[dict[str, Any]]) ->
     layouts = folder / "layouts"
     layouts.mkdir(parents=True, exist_ok=True)
     for entry in entries:
-        bare.with_baffles(entry["layout"]).to_toml(folder / entry["file"])
+        placed = bare.with_baffles(entry["layout"], size=entry.get("size"), yaw=entry.get("yaw"))
+        placed.to_toml(folder / entry["file"])
     kept = {Path(entry["file"]).name for entry in entries}
     for stale in layouts.glob("front-*.toml"):
         if stale.name not in kept:
@@ -81,17 +82,23 @@ def table(entries: Sequence[dict[str, Any]]) -> str:
     writer = csv.writer(text, lineterminator="\n")
     first = entries[0] if entries else {}
     names, measures = list(first.get("objectives") or ()), list(first.get("surrogate") or ())
-    layout = first.get("layout") or []
+    layout: list[list[float]] = max((e["layout"] for e in entries), key=len, default=[])
+    form = ["along", "height", "across"] if len(first.get("size", ())) == 3 else ["along", "height"]
+    form = [*form, "yaw"] if first.get("size") else []
     axes = [f"{a}{k + 1}" for k, c in enumerate(layout) for a in ("x", "z")[: len(c)]]
     groups = (("", names, "objectives"), ("", measures, "surrogate"))
     solver = (("verified_", names, "verified_objectives"), ("verified_", measures, "verified"))
     columns = [f"{prefix}{n}" for prefix, group, _ in (*groups, *solver) for n in group]
-    writer.writerow(["point", "trial", "origin", "file", "cost", "verified_cost", *columns, *axes])
+    writer.writerow(
+        ["point", "trial", "origin", "file", "cost", "verified_cost", *columns, *form, *axes]
+    )
     for entry in entries:
         row = [entry[k] for k in ("point", "trial", "origin", "file", "cost", "verified_cost")]
         for _, group, key in (*groups, *solver):
             row += [(entry[key] or {}).get(n, "") for n in group]
+        row += [*entry["size"], entry.get("yaw", 0.0)] if form else []
         row += [v for c in entry["layout"] for v in c]
+        row += [""] * (len(axes) - sum(map(len, entry["layout"])))
         writer.writerow(["" if v is None else repr(v) if isinstance(v, float) else v for v in row])
     return text.getvalue()
 

@@ -8,6 +8,7 @@ is best.
 
 from __future__ import annotations
 
+import inspect
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -21,6 +22,8 @@ from design.campaign import Campaign
 from design.chains import LEAST_STEP, STEP, Adam, Chain, Lbfgs
 from design.distinct import apart
 from design.risk import Flow, Risk, weigh
+from design.rules import FREE, PENALTY, Rules
+from design.space import FORM, DesignSpace, Space, built, split
 from design.trials import Outcome
 from gns_env.task import BaffleTask
 from gns_model import measures as hard
@@ -68,7 +71,7 @@ def _search(campaign: Campaign, kind: type[Chain]) -> None:
     first = True
     while campaign.left() >= 2:
         if first:
-            ranked = sorted((t for t in log.trials() if t.ok), key=lambda t: t.cost)
+            ranked = sorted((t for t in log.trials() if t.ok), key=lambda t: t.order)
             origins = apart([t.centres for t in ranked], STEP, count)
         else:
             origins = [c for _, c in random_layouts(space, count, campaign.rng(2))]
@@ -146,6 +149,8 @@ def smooth_costs(
     task: BaffleTask,
     centres: Sequence[Tensor],
     *,
+    forms: Sequence[tuple[Tensor, Tensor]] | None = None,
+    rules: Rules = FREE,
     limit: float | None = ADJOINT_LIMIT,
     smoothing: float = ADJOINT_SMOOTHING,
     draws: Sequence[int] | None = None,
@@ -155,31 +160,57 @@ def smooth_costs(
     Args:
         task: with a simulator that has a gradient.
         centres: of each layout [m], shape (n, D-1); may require grad.
+        forms: of each layout: size of its baffles [m], shape (D,), and yaw [degrees], shape (); may
+            require grad. Default: the task's.
+        rules: prices, and limits on the flow, whose excess costs `rules.PENALTY`.
         limit, smoothing: as `cost_and_gradient`.
         draws: the start of each layout (`LearnedSimulator.perturbed_start`); default: the usual.
     """
     import torch
 
-    from gns_model.smooth_measures import smooth_measures
+    from gns_model.smooth_measures import smooth_measures, smooth_overtopping
 
-    scenes = [task.scene_with(c.detach().numpy()) for c in centres]
+    if forms is None:
+        own = (torch.tensor(task.space.size), torch.tensor(float(task.space.yaw)))
+        forms = [own] * len(centres)
+    scenes = [
+        task.scene.with_baffles(c.detach().numpy(), size=size.tolist(), yaw=float(yaw))
+        for c, (size, yaw) in zip(centres, forms, strict=True)
+    ]
     simulator: Any = task.simulator
-    noise = None
+    more: dict[str, Any] = {}
     if draws is not None and any(draws):
-        noise = [
+        more["noise"] = [
             simulator.perturbed_start(scene, draw)
             for scene, draw in zip(scenes, draws, strict=True)
         ]
-    more: dict[str, Any] = {} if noise is None else {"noise": noise}
     more |= {"limit": limit, "smoothing": smoothing}
+    if any(size.requires_grad or yaw.requires_grad for size, yaw in forms):
+        counts = [len(c) for c in centres]
+        more["sizes"] = [s.expand(n, -1) for n, (s, _) in zip(counts, forms, strict=True)]
+        more["yaws"] = [y.expand(n) for n, (_, y) in zip(counts, forms, strict=True)]
     rollouts = simulator.rollout_tensor(scenes, centres, **more)
-    reference, size = task.reference, tuple(task.space.size)
     costs = []
-    for positions, scene, c in zip(rollouts, scenes, centres, strict=True):
-        measures = smooth_measures(positions, scene, c.to(positions), size, yaws=task.space.yaw)
-        terms = [objective.smooth(measures, reference) for objective in task.objectives]
-        costs.append(torch.stack([term.to(torch.float64).cpu() for term in terms]).sum())
+    for positions, scene, c, (size, yaw) in zip(rollouts, scenes, centres, forms, strict=True):
+        here, size_here = c.to(positions), size.to(positions)
+        turn = yaw if yaw.requires_grad or yaw else 0.0
+        measures = smooth_measures(positions, scene, here, size_here, yaws=turn)
+        if rules.max_overtopping is not None:
+            measures["overtopping"] = smooth_overtopping(positions, scene, here, size_here, turn)
+        terms = [objective.smooth(measures, task.reference) for objective in task.objectives]
+        terms += [PENALTY * torch.relu(e) for e in rules.excess(measures, size_here[1]).values()]
+        cost = torch.stack([term.to(torch.float64).cpu() for term in terms]).sum()
+        costs.append(cost + rules.price(len(c), len(c) * size.prod()))
     return rollouts, torch.stack(costs)
+
+
+def follows_forms(simulator: object) -> bool:
+    """Whether rollouts of `simulator` can be differentiated in size and yaw of the baffles.
+
+    Where they cannot, chains of steps keep the form that they start with.
+    """
+    rollout = getattr(simulator, "rollout_tensor", None)
+    return rollout is not None and "sizes" in inspect.signature(rollout).parameters
 
 
 def differentiate(task: BaffleTask, layouts: Sequence[np.ndarray]) -> list[Outcome]:
@@ -191,14 +222,20 @@ def differentiate(task: BaffleTask, layouts: Sequence[np.ndarray]) -> list[Outco
 
 
 def differentiate_flows(
-    tasks: Sequence[BaffleTask], layouts: Sequence[np.ndarray], risk: Risk
+    tasks: Sequence[BaffleTask],
+    layouts: Sequence[np.ndarray],
+    risk: Risk,
+    rules: Rules = FREE,
+    space: Space | None = None,
 ) -> list[Outcome]:
     """One rollout and one backward pass of each layout in each task, one task a scenario.
 
     Costs and gradients are the risk of those of the tasks: the hard costs say which flows count.
+    `space` says what the columns of a layout are; default: places alone.
     """
     started = time.perf_counter()
-    found = [_differentiate(task, layouts) for task in tasks]
+    space = space or tasks[0].space
+    found = [_differentiate(task, layouts, rules, space) for task in tasks]
     seconds = (time.perf_counter() - started) / len(layouts)
     failure = sum(objective.failure_cost for objective in tasks[0].objectives)
     outcomes = []
@@ -213,25 +250,64 @@ def differentiate_flows(
 
 
 def _differentiate(
-    task: BaffleTask, layouts: Sequence[np.ndarray]
+    task: BaffleTask, layouts: Sequence[np.ndarray], rules: Rules, space: Space
 ) -> list[tuple[Flow, np.ndarray | None]]:
-    import torch
-
-    centres = [torch.tensor(np.asarray(c, dtype=np.float64), requires_grad=True) for c in layouts]
-    rollouts, costs = smooth_costs(task, centres)
+    follows = follows_forms(task.simulator)
+    leaves = [_Leaves(space, layout, follows) for layout in layouts]
+    rollouts, costs = smooth_costs(
+        task, [leaf.centres for leaf in leaves], forms=[leaf.form for leaf in leaves], rules=rules
+    )
     costs.sum().backward()
-    return [_flow(task, p, c) for p, c in zip(rollouts, centres, strict=True)]
+    return [
+        _flow(task, p, built(task.scene, space, layout), leaf.gradient(), rules)
+        for p, layout, leaf in zip(rollouts, layouts, leaves, strict=True)
+    ]
 
 
-def _flow(task: BaffleTask, positions: Tensor, centres: Tensor) -> tuple[Flow, np.ndarray | None]:
-    """What the rollout (T, N, D) gave by hard measures, and the gradient (n, D-1)."""
+class _Leaves:
+    """A layout as the tensors that its rollout is differentiated in.
+
+    Attributes:
+        centres: [m], shape (n, D-1). form: size [m], shape (D,), and yaw [degrees], shape ().
+    """
+
+    def __init__(self, space: Space, layout: np.ndarray, follows: bool) -> None:
+        import torch
+
+        centres, form = split(space, layout)
+        self.centres = torch.tensor(np.array(centres, dtype=np.float64), requires_grad=True)
+        size, yaw = torch.tensor(form.size, dtype=torch.float64), torch.tensor(form.yaw)
+        self._names = space.names if isinstance(space, DesignSpace) else ()
+        self._degree = space.degree if isinstance(space, DesignSpace) else 0.0
+        size.requires_grad_(follows and any(name != "yaw" for name in self._names))
+        self.form = size, yaw.double().requires_grad_(follows and "yaw" in self._names)
+
+    def gradient(self) -> np.ndarray | None:
+        """By every column of the layout [1/m], shape (n, columns), after a backward pass.
+
+        The form is one for all rows: each row holds the whole derivative by it.
+        """
+        plan = self.centres.grad
+        if plan is None:
+            return None
+        size, yaw = self.form
+        columns = []
+        for name in self._names:
+            if name == "yaw":
+                columns.append(0.0 if yaw.grad is None else float(yaw.grad) / self._degree)
+            else:
+                columns.append(0.0 if size.grad is None else float(size.grad[FORM.index(name)]))
+        return np.column_stack([plan.numpy(), np.tile(columns, (len(plan), 1))])
+
+
+def _flow(
+    task: BaffleTask, positions: Tensor, scene: Scene, gradient: np.ndarray | None, rules: Rules
+) -> tuple[Flow, np.ndarray | None]:
+    """What the rollout (T, N, D) gave by hard measures, and the gradient if there is one."""
     config = task.simulator.config  # type: ignore[attr-defined]
-    scene = task.scene_with(centres.detach().numpy())
-    gradient = centres.grad.numpy() if centres.grad is not None else None
     frames = positions.detach().cpu().numpy()
     if gradient is None or not np.isfinite(gradient).all() or not _plausible(frames, scene):
-        costs = tuple(objective.failure_cost for objective in task.objectives)
-        return Flow(DIVERGED, {}, costs), None
+        return Flow.of(DIVERGED, {}, {}, task.objectives, rules), None
     trajectory = Trajectory(
         positions=frames,
         time=np.arange(len(frames)) * config.dt,
@@ -240,8 +316,9 @@ def _flow(task: BaffleTask, positions: Tensor, centres: Tensor) -> tuple[Flow, n
         point_volume=config.spacing**scene.dim,
         simulator=task.simulator.name,
     )
-    flow = Flow.of(OK, hard.summary(trajectory), task.reference, task.objectives)
-    return flow, gradient
+    measures = hard.summary(trajectory)
+    sizes = [baffle.size for baffle in scene.baffles]
+    return Flow.of(OK, measures, task.reference, task.objectives, rules, sizes), gradient
 
 
 def _plausible(frames: np.ndarray, scene: Scene) -> bool:

@@ -48,11 +48,11 @@ def leap(campaign: Campaign, chains: Sequence[Chain] = ()) -> list[Chain]:
     Without `chains`, or once Optuna has found better than they have, they start from the best
     layouts that no gradient has been taken at or near.
     """
-    trials = sorted((t for t in campaign.log.trials() if t.ok), key=lambda t: t.cost)
+    trials = sorted((t for t in campaign.log.trials() if t.ok), key=lambda t: t.outcome.merit)
     living = list(chains)
     if not trials:
         return living
-    if not living or trials[0].cost < min(chain.best_cost for chain in living):
+    if not living or trials[0].outcome.merit < min(chain.best_cost for chain in living):
         leapt = [t.centres for t in trials if t.origin == "gradient"]
         count = min(CHAINS, max(campaign.passes // PASSES_A_CHAIN, 1))
         origins = apart([t.centres for t in trials], STEP, count, avoid=leapt)
@@ -77,4 +77,6 @@ def look_around(campaign: Campaign) -> None:
         best = campaign.log.best()
         bayes.search(campaign, until=campaign.spent() + campaign.batch, startup=STARTUP)
         found = campaign.log.best()
-        paying = best is not None and found is not None and best.cost - found.cost > GAIN
+        if best is None or found is None:
+            return
+        paying = best.outcome.merit - found.outcome.merit > GAIN

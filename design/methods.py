@@ -26,24 +26,33 @@ class MethodError(SimulatorError, ValueError):
     """A method that does not exist or cannot search this task."""
 
 
-def choose(method: str | None, differentiable: bool, objectives: int, name: str) -> str:
+def choose(
+    method: str | None, differentiable: bool, objectives: int, name: str, pattern: str = "free"
+) -> str:
     """The method to use: `method` itself, or what suits the task if that is None.
 
     Args:
         differentiable: whether the simulator, called `name`, has a gradient.
         objectives: how many.
+        pattern: "free" or "rows".
 
     Raises:
         MethodError: if there is no such method, or it cannot search this task.
     """
     if method is None:
-        return "hybrid" if differentiable and objectives == 1 else "bayes"
+        follows = differentiable and objectives == 1 and pattern == "free"
+        return "hybrid" if follows else "bayes"
     if method not in METHODS:
         raise MethodError(f"no method {method!r}: give {', '.join(METHODS)}")
     if method in FOLLOW and not differentiable:
         raise MethodError(
             f"the simulator {name!r} has no gradient, so --method {method} cannot use it: choose "
             "a learned simulator such as baffle-lite, or --method bayes"
+        )
+    if method in FOLLOW and pattern == "rows":
+        raise MethodError(
+            f"--method {method} moves every baffle by itself, so it keeps no rows: give --method "
+            "bayes, tpe, gp, nsga2, rows or random with --pattern rows, or --pattern free"
         )
     if method in FOLLOW and objectives > 1:
         raise MethodError(

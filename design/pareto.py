@@ -14,9 +14,10 @@ def front(trials: Sequence[Trial]) -> list[Trial]:
     """The trials that no other beats: as good in every objective and better in one.
 
     By the first objective, best first; of equal ones the first tried. Failures and trials of one
-    objective are never on it.
+    objective are never on it, nor, if any trial keeps all limits, those that break one.
     """
     tried = [t for t in trials if t.ok and len(t.outcome.costs) > 1]
+    tried = [t for t in tried if t.outcome.feasible] or tried
     if not tried:
         return []
     costs = np.array([t.outcome.costs for t in tried])

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
+from design.rules import Rules
 from design.trials import Outcome
 from gns_env.objective import Objective
 from gns_model.errors import GnsError
@@ -68,11 +70,13 @@ MEAN = Risk()
 
 @dataclass(frozen=True)
 class Flow:
-    """What one rollout of a layout gave: how it ended, its measures, its cost by each objective."""
+    """What one rollout of a layout gave: how it ended, its measures, its cost by each objective,
+    and by how much it breaks each limit."""
 
     status: str
     measures: dict[str, float]
     costs: tuple[float, ...]
+    excess: dict[str, float] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -81,12 +85,21 @@ class Flow:
         measures: dict[str, float],
         reference: dict[str, float],
         objectives: Sequence[Objective],
+        rules: Rules | None = None,
+        sizes: Sequence[Sequence[float]] = (),
     ) -> Flow:
-        """From measures, relative to those without baffles of the same simulator and scenario."""
-        costs = tuple(
-            o.cost(measures, reference) if status == OK else o.failure_cost for o in objectives
-        )
-        return cls(status, measures, costs)
+        """From measures, relative to those without baffles of the same simulator and scenario.
+
+        `rules` for the baffles that stand, of `sizes` [m]: a price, which joins the first cost, and
+        limits.
+        """
+        rules = rules or Rules()
+        if status != OK:
+            return cls(status, measures, tuple(o.failure_cost for o in objectives), rules.failed())
+        costs = [o.cost(measures, reference) for o in objectives]
+        costs[0] += rules.price(len(sizes), sum(map(math.prod, sizes)))
+        lowest = min((size[1] for size in sizes), default=None)
+        return cls(status, measures, tuple(costs), rules.excess(measures, lowest))
 
 
 def weigh(flows: Sequence[Flow], risk: Risk, failure_cost: float) -> Outcome:
@@ -109,4 +122,6 @@ def weigh(flows: Sequence[Flow], risk: Risk, failure_cost: float) -> Outcome:
         rollouts=len(flows),
         costs=tuple(risk.of(column) for column in costs.T) if several else (),
         flows=tuple(total.tolist()) if len(flows) > 1 else (),
+        # A limit is to be kept in every flow.
+        excess={name: max(f.excess[name] for f in flows) for name in flows[0].excess},
     )

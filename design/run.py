@@ -33,8 +33,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from design import refine
-from design.blame import room_for
 from design.campaign import Campaign, Evaluator
+from design.constraints import constraints, to_blame
 from design.distinct import among
 from design.ensemble import POOL, Ensemble, Panel, beyond_limits
 from design.evaluators import InProcess, InWorkers, SimulatorSpec, TaskSpec, failure_cost
@@ -43,8 +43,11 @@ from design.front import front_entries, relative, write_front
 from design.methods import METHODS, choose
 from design.pareto import front, spread
 from design.risk import Flow, weigh
+from design.rows import RowSpace
+from design.rules import Rules
 from design.scenarios import Scenarios, scenes, widest
 from design.settings import Settings
+from design.space import DesignSpace, Form, Space, built, design_space, form_of, numbers, split
 from design.store import Pending, Rolled, RolloutStore, Watch
 from design.summary import (
     COMPLETE,
@@ -131,6 +134,7 @@ class Run:
         continued: Continued | None = None,
     ) -> None:
         self._began = time.perf_counter()
+        scene = settings.applied(scene)
         self.scene, self.out, self.settings, self.command = scene, out, settings, list(command)
         self.ranked: list[Judged] = []
         self.paper: Judged | None = None
@@ -142,7 +146,6 @@ class Run:
         self.rounds: list[dict[str, Any]] = []
         self.models = {"": settings.simulator}
         self.kept: set[Path] = set()
-        self.baffles = settings.baffles or len(scene.baffles) or 3
         self.drawn: list[Scenario] = []
         self.notes: list[str] = []
         flows = [scene.with_baffles([])]
@@ -157,16 +160,24 @@ class Run:
         else:
             own = {"size": scene.baffle_size, "yaw": scene.baffle_yaw or None}
             largest = largest.replace(placement=scene.placement.model_copy(update=own))
-        self.space = room_for(largest, self.baffles)
+        asked = settings.baffles or len(scene.baffles) or 3
+        rows = settings.pattern == "rows"
+        self.space: Space = RowSpace(largest, asked) if rows else design_space(largest, asked)
+        #: How many; where the number varies, the one to begin with.
+        self.baffles = self.space.n_baffles
         #: The scene without baffles, and each flow on it that a layout has to stand.
         self.bare = scene.replace(baffles=(), placement=self.space.placement)
         self.flows = [flow.replace(placement=self.space.placement) for flow in flows]
+        self.rules = Rules.of(self.bare, settings.baffle_cost, settings.concrete_cost)
+        if isinstance(self.space, DesignSpace):
+            self.notes += self.space.notes
         self.notes += _check([scene, *self.flows] if self.drawn else [scene], settings)
         self.method = choose(
             settings.method,
             has_gradient(settings.simulator.load()),
             len(settings.parts),
             settings.simulator.name,
+            settings.pattern,
         )
         of_use = max(settings.batch, settings.verify + 2)
         self.ensemble = (
@@ -208,6 +219,10 @@ class Run:
         }
         if s.objectives:
             task["set of objectives"] = list(s.objectives)
+        if s.pattern != "free":
+            task["pattern"] = s.pattern
+        if self.rules.charges:
+            task["price"] = [s.baffle_cost, s.concrete_cost]
         if s.scenarios:
             task["set of scenarios"] = [asdict(flow) for flow in self.drawn]
             task["risk"] = asdict(s.risk)
@@ -272,7 +287,7 @@ class Run:
         task = bar.add_task("report", total=1)
         with self.timed("report"):
             if self.ranked:
-                best = self.bare.with_baffles(self.ranked[0].centres)
+                best = self.built(self.bare, self.ranked[0])
                 write_geometry(best, self.out / "layouts", "best")
             write_report(self.out)
         bar.advance(task)
@@ -286,6 +301,7 @@ class Run:
         self.summary = {
             "status": status,
             **results(ranked, self.paper, self.none, trials, s.objective),
+            **self._kept(ranked, trials),
             **self._several(trials),
             **({"ensemble": self.ensemble.describe()} if self.ensemble else {}),
             **({"refined": self.rounds} if s.refine else {}),
@@ -306,6 +322,7 @@ class Run:
                 "verify_with": s.verifier.describe(),
                 "objective": {**asdict(s.objective), "text": str(s.objective)},
                 **({"objectives": ",".join(s.objectives)} if s.objectives else {}),
+                **_freed(s),
                 **({"scenarios": _described(s.scenarios)} if s.scenarios else {}),
                 **_trusted(s),
                 "storage": self.storage.rsplit("@", 1)[-1],
@@ -316,7 +333,7 @@ class Run:
             self.summary[spent] += sum(told[spent] for told in self.rounds)
         write_summary(self.out, self.summary)
         write_trials(self.out, self.log)
-        write_layouts(self.out, self.bare, ranked)
+        write_layouts(self.out, self.bare, self.space, ranked)
         if s.objectives:
             write_front(self.out, self.bare, self.summary["front"])
 
@@ -326,7 +343,9 @@ class Run:
         found: dict[str, Any] = {}
         if s.objectives:
             found["objectives"] = [str(part) for part in s.parts]
-            found["front"] = front_entries(front(trials), s.parts, s.objectives, self.ranked)
+            found["front"] = front_entries(
+                front(trials), s.parts, s.objectives, self.ranked, self.space
+            )
             found["tried"] = [
                 relative(t.outcome.costs, s.parts, s.objectives) for t in trials if t.ok
             ]
@@ -376,7 +395,7 @@ class Run:
         elif layout.origin == "scene":
             flows = [self._own(flow) for flow in self.flows]
         else:
-            flows = [flow.with_baffles(layout.centres) for flow in self.flows]
+            flows = [self.built(flow, layout) for flow in self.flows]
         return [store.start(spec, flow, trajectory=trajectory) for flow in flows]
 
     def _panel(self, store: RolloutStore, watch: Watch) -> Panel:
@@ -396,7 +415,7 @@ class Run:
         """One layout in all flows, relative to no baffles in each."""
         s = self.settings
         flows = [
-            Flow.of(r.status, r.measures, n.measures, s.parts)
+            Flow.of(r.status, r.measures, n.measures, s.parts, self.rules, r.sizes)
             for r, n in zip(rolled, none, strict=True)
         ]
         return weigh(flows, s.risk, failure_cost(s.parts))
@@ -424,14 +443,19 @@ class Run:
 
     def _log_own_layout(self, centres: np.ndarray, outcome: Outcome) -> None:
         """The scene's own layout is a trial too, where the search could have proposed it."""
-        alike = all(
-            np.allclose(b.size, self.space.size) and np.isclose(b.yaw, self.space.yaw)
-            for b in self.scene.baffles
-        )
-        if len(centres) != self.baffles or not alike or self.space.check(centres):
+        forms = {Form(b.size, b.yaw) for b in self.scene.baffles}
+        if len(forms) > 1:
+            return
+        layout, form = centres, forms.pop()
+        if isinstance(self.space, DesignSpace):
+            layout = self.space.join(centres, form)
+        alike = split(self.space, layout)[1]
+        if not np.allclose((*form.size, form.yaw), (*alike.size, alike.yaw)):
+            return
+        if len(centres) not in numbers(self.space) or self.space.check(layout):
             return
         if not any(trial.origin == "scene" for trial in self.log.trials()):
-            self.log.add("scene", centres, outcome)
+            self.log.add("scene", layout, outcome)
 
     def _search(self, workers: Workers, references: Sequence[Rolled], watch: Watch) -> None:
         s, log = self.settings, self.log
@@ -444,7 +468,9 @@ class Run:
             if trial.ok:
                 # Only what may be best or on the front has to be remembered.
                 tried[:] = front([*tried, trial]) if s.objectives else [*tried, trial]
-                said = f"best {min(t.cost for t in tried):.4f}"
+                best = min(tried, key=lambda t: t.order)
+                said = f"best {best.cost:.4f}"
+                said += "" if best.outcome.feasible else ", which breaks a limit"
                 said = f"front of {len(tried)}, {said}" if s.objectives else said
                 bar.update(task, description=f"{title}, {said}")
             bar.advance(task, trial.outcome.rollouts + trial.outcome.backwards)
@@ -467,19 +493,41 @@ class Run:
 
     def _evaluator(self, workers: Workers, references: list[Path], watch: Watch) -> Evaluator:
         s = self.settings
-        spec = TaskSpec.of(self.flows, self.baffles, s.parts, s.simulator, references, s.risk)
+        spec = TaskSpec.of(
+            self.flows, self.baffles, s.parts, s.simulator, references, s.risk, self.rules
+        )
         if s.simulator.device != "cpu":
-            return InProcess(spec.tasks(), s.risk)
+            return InProcess(spec.tasks(), s.risk, self.rules, spec.space())
         return InWorkers(workers, spec, watch.update)
 
     def _candidates(self, count: int) -> list[Judged]:
         if self.settings.objectives:
-            return [as_judged(t) for t in spread(front(self.log.trials()), count)]
+            return self._formed([as_judged(t) for t in spread(front(self.log.trials()), count)])
         # Closer than a third of a baffle is one design.
         least = float(min(self.space.size[[0, *range(2, self.scene.dim)]])) / 3
         known = [] if self.paper is None else [self.paper.centres]
         known += self.continued.avoid if self.continued else []
-        return candidates(self.log.trials(), count, least, avoid=known)
+        return self._formed(candidates(self.log.trials(), count, least, avoid=known))
+
+    def _formed(self, layouts: list[Judged]) -> list[Judged]:
+        for layout in layouts:
+            layout.form = form_of(self.space, layout.centres)
+        return layouts
+
+    def built(self, flow: Scene, layout: Judged) -> Scene:
+        """`flow` with the baffles of a layout that the search proposed."""
+        return built(flow, self.space, layout.centres)
+
+    def _kept(self, ranked: Sequence[Judged], trials: Sequence[Trial]) -> dict[str, Any]:
+        """What summary.json says of the constraints of the best, and of those that none keeps."""
+        if not ranked:
+            return {}
+        scene = self.built(self.bare, ranked[0])
+        found = {"constraints": constraints(scene, self.rules, ranked[0])}
+        line = to_blame(self.rules, [t.outcome for t in trials if t.ok])
+        if line:
+            self._note(line)
+        return found
 
     def _verify(
         self,
@@ -495,7 +543,7 @@ class Run:
             chosen = panel.choose(self._candidates(POOL * s.verify), s.verify)
             panel.judge([j for j in (self.paper,) if j is not None])
         for one in chosen:
-            one.marks += beyond_limits(s.simulator, self.bare.with_baffles(one.centres))
+            one.marks += beyond_limits(s.simulator, self.built(self.bare, one))
         pending = [self.roll(store, s.verifier, one) for one in chosen]
         started = [p for ps in pending for p in ps]
         watch.add(f"verify: best {len(chosen)}", started)
@@ -537,7 +585,7 @@ class Run:
                 if self.scene.baffles:
                     shown["paper"] = store.start(spec, self._own(self.bare))
             if self.ranked:
-                best = self.bare.with_baffles(self.ranked[0].centres)
+                best = self.built(self.bare, self.ranked[0])
                 # Whoever found it: a refined model knows more than the one that was given.
                 who = self.models[self.ranked[0].model] if role == "learned" else spec
                 shown["best"] = store.start(who, best)
@@ -581,6 +629,19 @@ def _described(scenarios: Scenarios) -> dict[str, Any]:
         **{name: f"{r[0]:g}:{r[1]:g}" for name, r in ranges.items() if r is not None},
         "risk": scenarios.risk.kind,
         **({"level": scenarios.risk.level} if scenarios.risk.kind == "cvar" else {}),
+    }
+
+
+def _freed(settings: Settings) -> dict[str, Any]:
+    """The options of variables, limits and prices, as words for the same command.
+
+    What they put into the placement stands in scene.toml of the run.
+    """
+    s = settings
+    return {
+        **({"pattern": s.pattern} if s.pattern != "free" else {}),
+        **({"baffle_cost": s.baffle_cost} if s.baffle_cost else {}),
+        **({"concrete_cost": s.concrete_cost} if s.concrete_cost else {}),
     }
 
 

@@ -24,7 +24,9 @@ from design.evaluators import InProcess, differentiable
 from design.gradient import cost_and_gradient
 from design.methods import METHODS, choose
 from design.pareto import front
-from design.settings import SettingError
+from design.rows import RowSpace
+from design.rules import Rules
+from design.settings import SettingError, check_pattern
 from design.trials import Trial, TrialLog
 from gns_env.task import BaffleTask
 
@@ -47,8 +49,11 @@ class Result:
 
     @property
     def best(self) -> Trial | None:
-        """The trial of least cost (of several objectives: of least sum), None if all failed."""
-        return min((t for t in self.trials if t.ok), key=lambda t: t.cost, default=None)
+        """The trial of least cost (of several objectives: of least sum), None if all failed.
+
+        One that breaks a limit on the flow comes only where every one does.
+        """
+        return min((t for t in self.trials if t.ok), key=lambda t: t.order, default=None)
 
     @property
     def front(self) -> list[Trial]:
@@ -69,7 +74,7 @@ class Result:
     def curve(self) -> np.ndarray:
         """The least cost so far against passes spent, shape (trials, 2): passes, cost."""
         passes = np.cumsum([t.outcome.rollouts + t.outcome.backwards for t in self.trials])
-        costs = [t.cost if t.ok else np.inf for t in self.trials]
+        costs = [t.cost if t.outcome.feasible else np.inf for t in self.trials]
         return np.column_stack([passes, np.minimum.accumulate(costs)]).reshape(-1, 2)
 
     def __str__(self) -> str:
@@ -88,18 +93,24 @@ def optimize(
     budget: int = 48,
     seed: int = 0,
     batch: int = 8,
+    pattern: str = "free",
+    baffle_cost: float = 0.0,
+    concrete_cost: float = 0.0,
     on_trial: Callable[[Trial], None] = lambda trial: None,
 ) -> Result:
     """Search for a layout of small cost, in this process and in memory.
 
     Args:
-        task: what to search; with several objectives, for their Pareto front.
+        task: what to search; with several objectives, for their Pareto front. What its placement
+            lets vary (`placement.vary`) is searched too, and its limits are kept.
         method: "random", "rows", "bayes", "tpe", "gp", "nsga2", "gradient", "lbfgs" or "hybrid";
             default: hybrid where the simulator has a gradient, else bayes.
         budget: passes through a rollout; a backward pass counts like a forward one. The flow
             without baffles comes on top.
         seed: of everything random.
         batch: layouts proposed at a time; each batch is one batched rollout.
+        pattern: "free", or "rows" as an engineer draws them.
+        baffle_cost, concrete_cost: of each baffle and m³ of concrete, in units of the objective.
         on_trial: called with every trial as it ends.
 
     Raises:
@@ -112,10 +123,13 @@ def optimize(
             raise SettingError(f"{name} must be {least} or more, got {value}")
     several = len(task.objectives)
     simulator = task.simulator
-    method = choose(method, differentiable(simulator), several, simulator.name)
+    check_pattern(pattern)
+    method = choose(method, differentiable(simulator), several, simulator.name, pattern)
     began = time.perf_counter()
     study = optuna.create_study(directions=["minimize"] * several)
-    log = TrialLog(study, task.space)
-    campaign = Campaign(log, InProcess(task), budget, seed, batch, on_trial)
+    evaluator = InProcess(task, rules=Rules.of(task.scene, baffle_cost, concrete_cost))
+    if pattern == "rows":
+        evaluator.space = RowSpace(task.scene, task.space.n_baffles)
+    campaign = Campaign(TrialLog(study, evaluator.space), evaluator, budget, seed, batch, on_trial)
     METHODS[method](campaign)
-    return Result(method, tuple(log.trials()), time.perf_counter() - began)
+    return Result(method, tuple(campaign.log.trials()), time.perf_counter() - began)

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from design.evaluators import SimulatorSpec
 from design.methods import METHODS
 from design.objectives import joined, split
 from design.risk import Risk
+from design.rules import Rules
 from design.scenarios import Scenarios
+from gns_env.layout import LayoutSpace
 from gns_env.objective import Objective
 from gns_model.errors import GnsError
+from gns_model.scene import Scene
 
 #: Layouts of a search that is given no budget; a gradient counts twice.
 DEFAULT_BUDGET = 48
@@ -20,6 +25,12 @@ DEFAULT_BUDGET = 48
 
 class SettingError(GnsError, ValueError):
     """A setting out of its range: the message names it and what is allowed."""
+
+
+def check_pattern(pattern: str) -> None:
+    """Raise SettingError if there is no such pattern."""
+    if pattern not in ("free", "rows"):
+        raise SettingError(f"pattern must be free or rows, got {pattern!r}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +57,10 @@ class Settings:
         refine: rounds in which verified layouts are fed back into training.
         refine_minutes: of training in each round.
         refine_data: folder of trajectories that the model must not forget, if any.
+        pattern: "free", or "rows" as an engineer draws them.
+        baffle_cost, concrete_cost: of each baffle and m³ of concrete, in units of the objective.
+        placement: values that replace those of the scene's placement, by name, such as max_height;
+            under `vary` those of its table `vary`.
 
     Raises:
         SettingError: for a value out of its range.
@@ -69,6 +84,10 @@ class Settings:
     refine: int = 0
     refine_minutes: float = 5.0
     refine_data: Path | None = None
+    pattern: str = "free"
+    baffle_cost: float = 0.0
+    concrete_cost: float = 0.0
+    placement: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         least = {"budget": 1, "verify": 0, "batch": 1, "seed": 0, "workers": 1, "baffles": 1}
@@ -90,6 +109,13 @@ class Settings:
             raise SettingError(f"refine_minutes must be positive, got {self.refine_minutes:g}")
         if self.objectives:
             object.__setattr__(self, "objective", joined(self.parts))
+        check_pattern(self.pattern)
+        Rules(baffle_cost=self.baffle_cost, concrete_cost=self.concrete_cost)
+        if self.objectives and (self.baffle_cost or self.concrete_cost):
+            raise SettingError(
+                "a price of baffles joins one objective: give no --baffle-cost and no "
+                "--concrete-cost with --objectives"
+            )
         if self.method is not None and self.method not in METHODS:
             raise SettingError(f"no method {self.method!r}: give {', '.join(METHODS)}")
 
@@ -107,6 +133,21 @@ class Settings:
     def passes(self) -> int:
         """The budget in rollouts."""
         return DEFAULT_BUDGET * self.flows if self.budget is None else self.budget
+
+    def applied(self, scene: Scene) -> Scene:
+        """`scene` with the values of `placement` in place of its own.
+
+        Raises:
+            SceneError: if one of them cannot be.
+        """
+        if not self.placement:
+            return scene
+        # A scene without a placement gets the usual one, to put the values into.
+        own = scene.placement or LayoutSpace(scene, 1).placement
+        values = own.model_dump()
+        vary = {**(values["vary"] or {}), **self.placement.get("vary", {})}
+        values |= {**self.placement, "vary": vary or None}
+        return scene.replace(placement=values)
 
     @property
     def risk(self) -> Risk:

@@ -31,12 +31,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Rolled:
-    """A finished rollout: how it ended, its measures, what it cost [s], and its trajectory file."""
+    """A finished rollout: how it ended, its measures, what it cost [s], its trajectory file, and
+    the sizes of its baffles [m]."""
 
     status: str
     measures: dict[str, float]
     seconds: float
     path: Path
+    sizes: tuple[tuple[float, ...], ...] = ()
 
 
 class Pending:
@@ -136,6 +138,7 @@ def simulate_job(spec: SimulatorSpec, scene: str, path: Path, slot: int) -> None
         "status": trajectory.status,
         "measures": values,
         "seconds": time.perf_counter() - started,
+        "sizes": [baffle.size for baffle in trajectory.scene.baffles],
     }
     write_whole(path.with_suffix(".json"), json.dumps(record, indent=1).encode())
 
@@ -143,6 +146,7 @@ def simulate_job(spec: SimulatorSpec, scene: str, path: Path, slot: int) -> None
 def _read(path: Path) -> Rolled | None:
     try:
         record = json.loads(path.with_suffix(".json").read_text())
-        return Rolled(record["status"], record["measures"], record["seconds"], path)
+        sizes = tuple(tuple(map(float, size)) for size in record["sizes"])
+        return Rolled(record["status"], record["measures"], record["seconds"], path, sizes)
     except (OSError, ValueError, KeyError):
         return None

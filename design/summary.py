@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from design.space import Space, built
 from design.trials import Trial, TrialLog, table
 from design.verify import Judged, gap, verdict
 from gns_env.objective import Objective
@@ -55,16 +56,16 @@ def write_summary(folder: Path, summary: dict[str, Any]) -> None:
 
 def write_trials(folder: Path, log: TrialLog) -> None:
     """Write trials.csv."""
-    write_whole(folder / "trials.csv", table(log.trials()).encode())
+    write_whole(folder / "trials.csv", table(log.trials(), log.space).encode())
 
 
-def write_layouts(folder: Path, bare: Scene, ranked: Sequence[Judged]) -> None:
+def write_layouts(folder: Path, bare: Scene, space: Space, ranked: Sequence[Judged]) -> None:
     """Write layouts/best.toml, rank-2.toml, ... and delete what an earlier ranking left."""
     layouts = folder / "layouts"
     layouts.mkdir(parents=True, exist_ok=True)
     names = ["best.toml", *(f"rank-{k}.toml" for k in range(2, len(ranked) + 1))]
     for name, judged in zip(names, ranked, strict=False):
-        bare.with_baffles(judged.centres).to_toml(layouts / name)
+        built(bare, space, judged.centres).to_toml(layouts / name)
     for stale in layouts.glob("rank-*.toml"):
         if stale.name not in names:
             stale.unlink()

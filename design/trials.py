@@ -13,7 +13,7 @@ import io
 import json
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +23,10 @@ from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy import event
 from sqlalchemy.exc import SQLAlchemyError
 
-from design.parameters import names, ordered, to_centres, to_parameters
-from gns_env.layout import LayoutSpace
+from design.distinct import distance
+from design.parameters import distributions, ordered, plan_dim, to_centres, to_parameters
+from design.rules import PENALTY, broken
+from design.space import FORM, DesignSpace, Space
 from gns_model.errors import GnsError
 
 optuna.logging.set_verbosity(optuna.logging.ERROR)
@@ -48,6 +50,7 @@ class Outcome:
         gradient: d(smooth cost)/d(centres) [1/m], shape (n, D-1), if it was asked for.
         costs: one cost for each objective, of a search with several; `cost` is their sum.
         flows: the cost in each scenario, of a robust search; `cost` is their mean or CVaR then.
+        excess: by how much each limit on the flow is broken; 0 or less where it is kept.
     """
 
     cost: float
@@ -59,6 +62,22 @@ class Outcome:
     gradient: np.ndarray | None = None
     costs: tuple[float, ...] = ()
     flows: tuple[float, ...] = ()
+    excess: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def feasible(self) -> bool:
+        """Whether the rollout reached its end and every limit is kept."""
+        return self.status == "ok" and broken(self.excess) == 0
+
+    @property
+    def order(self) -> tuple[float, float]:
+        """What layouts are ranked by, least first: what is broken of the limits, then the cost."""
+        return broken(self.excess), self.cost
+
+    @property
+    def merit(self) -> float:
+        """The cost, and a penalty for what is broken of the limits: what a gradient makes small."""
+        return self.cost + PENALTY * broken(self.excess)
 
 
 @dataclass(frozen=True)
@@ -80,6 +99,11 @@ class Trial:
         """Whether the rollout reached its end."""
         return self.outcome.status == "ok"
 
+    @property
+    def order(self) -> tuple[float, float]:
+        """See `Outcome.order`."""
+        return self.outcome.order
+
 
 @dataclass(frozen=True)
 class Proposal:
@@ -93,11 +117,9 @@ class Proposal:
 class TrialLog:
     """An Optuna study seen as layouts: ask for some, tell what they gave, look at all."""
 
-    def __init__(self, study: optuna.Study, space: LayoutSpace) -> None:
+    def __init__(self, study: optuna.Study, space: Space) -> None:
         self.study, self.space = study, space
-        self.distributions: dict[str, optuna.distributions.BaseDistribution] = {
-            name: optuna.distributions.FloatDistribution(0.0, 1.0) for name in names(space)
-        }
+        self.distributions = distributions(space)
         self._asked: dict[int, optuna.Trial] = {}
         self._backend: optuna.storages.RDBStorage | None = None
 
@@ -106,7 +128,7 @@ class TrialLog:
         cls,
         storage: str,
         name: str,
-        space: LayoutSpace,
+        space: Space,
         task: dict[str, Any],
         *,
         resume: bool,
@@ -172,7 +194,7 @@ class TrialLog:
     def enqueue(self, origin: str, centres: np.ndarray) -> None:
         """Have `ask` return a layout before the sampler's own, unless it was tried already."""
         centres = self.buildable(centres)
-        if any(np.allclose(t.centres, centres, atol=1e-6) for t in self.trials()):
+        if any(distance(t.centres, centres) < 1e-6 for t in self.trials()):
             return
         self.study.enqueue_trial(
             to_parameters(self.space, centres), user_attrs={"origin": origin}, skip_if_exists=True
@@ -182,6 +204,8 @@ class TrialLog:
         """Record what a proposal gave. A failure is told with its finite penalty."""
         trial = self._asked.pop(proposal.number)
         trial.set_user_attr("record", _record(proposal.origin, proposal.centres, outcome))
+        for name, value in outcome.excess.items():
+            trial.set_constraint(name, value)
         self.study.tell(trial, self._values(outcome))
         return Trial(proposal.number, proposal.origin, proposal.centres, outcome)
 
@@ -194,6 +218,7 @@ class TrialLog:
                 distributions=self.distributions,
                 values=self._values(outcome),
                 user_attrs={"record": _record(origin, centres, outcome)},
+                constraints=outcome.excess,
             )
         )
         return Trial(len(self.study.get_trials(deepcopy=False)) - 1, origin, centres, outcome)
@@ -222,9 +247,9 @@ class TrialLog:
     def buildable(self, centres: np.ndarray) -> np.ndarray:
         """The nearest layout that holds every constraint, numbered across the flow."""
         centres = np.asarray(centres, dtype=float)
-        if not self.space.check(centres):
-            return ordered(centres)
-        return ordered(np.asarray(self.space.project(centres), dtype=float))
+        if self.space.check(centres):
+            centres = np.asarray(self.space.project(centres), dtype=float)
+        return ordered(centres, plan_dim(self.space))
 
     def trials(self) -> list[Trial]:
         """Everything that was tried, in the order it was asked for."""
@@ -232,41 +257,58 @@ class TrialLog:
         return [trial for trial in map(_trial, finished) if trial is not None]
 
     def best(self) -> Trial | None:
-        """The trial of least cost among those whose rollout reached its end."""
-        return min((t for t in self.trials() if t.ok), key=lambda t: t.cost, default=None)
+        """The trial of least cost among those whose rollout reached its end, and kept the limits if
+        any did."""
+        return min((t for t in self.trials() if t.ok), key=lambda t: t.order, default=None)
 
     def spent(self) -> int:
         """Passes through a rollout so far: forward and backward ones, each counts one."""
         return sum(t.outcome.rollouts + t.outcome.backwards for t in self.trials())
 
 
-def table(trials: Sequence[Trial]) -> str:
-    """Trials as CSV text with a header."""
+def table(trials: Sequence[Trial], space: Space | None = None) -> str:
+    """Trials as CSV text with a header; `space` says what varies beside the places."""
     measures = list(dict.fromkeys(name for t in trials for name in t.outcome.measures))
     axes = ("x", "z")
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    columns = [
-        f"{axes[j]}{k + 1}"
-        for k in range(max((len(t.centres) for t in trials), default=0))
-        for j in range(trials[0].centres.shape[1])
-    ]
+    varied = space.names if isinstance(space, DesignSpace) else ()
+    plan = trials[0].centres.shape[1] - len(varied) if trials else 0
+    most = max((len(t.centres) for t in trials), default=0)
+    columns = [f"{axes[j]}{k + 1}" for k in range(most) for j in range(plan)]
+    limits = list(trials[0].outcome.excess) if trials else []
     spent = ["rollouts", "backwards", "seconds"]
     parts = [
         *(f"cost_{k + 1}" for k in range(max((len(t.outcome.costs) for t in trials), default=0))),
         *(f"flow_{k + 1}" for k in range(max((len(t.outcome.flows) for t in trials), default=0))),
     ]
-    writer.writerow(["number", "origin", "status", "cost", *parts, *measures, *columns, *spent])
+    broken_by = [f"excess_{name}" for name in limits]
+    writer.writerow(
+        ["number", "origin", "status", "cost", *parts, *measures, *broken_by]
+        + [*varied, *columns, *spent]
+    )
     for t in trials:
         o = t.outcome
         writer.writerow(
             [t.number, t.origin, o.status, repr(float(o.cost))]
             + [repr(float(c)) for c in (*o.costs, *o.flows)]
             + [repr(float(o.measures[m])) if m in o.measures else "" for m in measures]
-            + [f"{c:.6f}" for c in t.centres.ravel()]
+            + [f"{o.excess.get(name, 0.0):.6f}" for name in limits]
+            + [f"{value:.6f}" for value in _form_of(space, t.centres).values()]
+            + [f"{c:.6f}" for c in t.centres[:, :plan].ravel()]
+            + [""] * ((most - len(t.centres)) * plan)
             + [o.rollouts, o.backwards, f"{o.seconds:.3f}"]
         )
     return text.getvalue()
+
+
+def _form_of(space: Space | None, layout: np.ndarray) -> dict[str, float]:
+    """What varies of the form of a layout, by name: sizes [m], yaw [degrees]."""
+    if not isinstance(space, DesignSpace):
+        return {}
+    _, form = space.split(layout)
+    known = {"yaw": form.yaw, **dict(zip(FORM, form.size, strict=False))}
+    return {name: known[name] for name in space.names}
 
 
 @contextlib.contextmanager
@@ -321,6 +363,7 @@ def _record(origin: str, centres: np.ndarray, outcome: Outcome) -> dict[str, Any
         "seconds": outcome.seconds,
         "costs": list(outcome.costs),
         "flows": list(outcome.flows),
+        "excess": outcome.excess,
     }
 
 
@@ -337,6 +380,7 @@ def _trial(frozen: FrozenTrial) -> Trial | None:
         seconds=float(record["seconds"]),
         costs=tuple(map(float, record.get("costs", ()))),
         flows=tuple(map(float, record.get("flows", ()))),
+        excess={name: float(value) for name, value in record.get("excess", {}).items()},
     )
     return Trial(frozen.number, str(record["origin"]), np.array(record["centres"]), outcome)
 

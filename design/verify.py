@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 
 from design.distinct import apart
+from design.rules import broken
+from design.space import Form, described
 from design.trials import Outcome, Trial
 
 
@@ -32,6 +34,8 @@ class Judged:
         spread: of an ensemble's members over this layout, by measure; see `ensemble`.
         ensemble_cost: mean of the costs that they give it.
         marks: why the simulator that searched may be out of its depth here, in words.
+        excess, verified_excess: by how much each limit on the flow is broken.
+        form: size and yaw of its baffles, where that is not the scene's.
         model: the refined model that found it, "refined-1" and so on; "": the one that was given.
     """
 
@@ -50,10 +54,27 @@ class Judged:
     ensemble_cost: float | None = None
     marks: list[str] = field(default_factory=list)
     model: str = ""
+    excess: dict[str, float] = field(default_factory=dict)
+    verified_excess: dict[str, float] | None = None
+    form: Form | None = None
+
+    @property
+    def order(self) -> tuple[bool, float, float]:
+        """What layouts are ranked by: verified ones first, then what is broken of the limits."""
+        if self.verified_cost is None:
+            return True, broken(self.excess), self.cost or 0.0
+        return False, broken(self.verified_excess or {}), self.verified_cost
+
+    @property
+    def feasible(self) -> bool:
+        """Whether every limit is kept, as the reference solver says if it has."""
+        known = self.excess if self.verified_excess is None else self.verified_excess
+        return broken(known) == 0
 
     def take(self, outcome: Outcome) -> None:
         """Take in what the reference solver says of all flows."""
         self.verified_status, self.verified_cost = outcome.status, outcome.cost
+        self.verified_excess = dict(outcome.excess)
         if outcome.status == "ok":
             self.verified = outcome.measures
             self.verified_costs, self.verified_flows = outcome.costs, outcome.flows
@@ -72,7 +93,7 @@ class Judged:
         if self.model:
             several["model"] = self.model
         return {
-            "layout": np.round(self.centres, 6).tolist(),
+            **described(self.centres, self.form),
             "origin": self.origin,
             "cost": self.cost,
             "surrogate": self.surrogate,
@@ -90,7 +111,7 @@ def candidates(
 
     Neighbours of the best would only verify the same thing again.
     """
-    ranked = sorted((t for t in trials if t.ok), key=lambda t: (t.cost, t.number))
+    ranked = sorted((t for t in trials if t.ok), key=lambda t: (*t.order, t.number))
     chosen = apart([t.centres for t in ranked], least, count, avoid=avoid)
     by_layout = {id(t.centres): t for t in ranked}
     return [as_judged(by_layout[id(c)]) for c in chosen]
@@ -100,19 +121,22 @@ def as_judged(trial: Trial) -> Judged:
     """A trial as what the reference solver has not seen yet."""
     o = trial.outcome
     return Judged(
-        trial.origin, trial.centres, dict(o.measures), o.cost, costs=o.costs, flows=o.flows
+        trial.origin,
+        trial.centres,
+        dict(o.measures),
+        o.cost,
+        costs=o.costs,
+        flows=o.flows,
+        excess=dict(o.excess),
     )
 
 
 def rank(judged: Sequence[Judged]) -> list[Judged]:
-    """Best first: by verified cost, what is not verified behind it by the search's cost."""
-    return sorted(
-        judged,
-        key=lambda j: (
-            j.verified_cost is None,
-            j.verified_cost if j.verified_cost is not None else (j.cost or 0.0),
-        ),
-    )
+    """Best first: by verified cost, what is not verified behind it by the search's cost.
+
+    Of either, what breaks a limit comes behind all that keep them.
+    """
+    return sorted(judged, key=lambda j: j.order)
 
 
 def gap(judged: Sequence[Judged]) -> dict[str, dict[str, float]]:
@@ -161,7 +185,7 @@ def spearman(a: np.ndarray, b: np.ndarray) -> float | None:
 
 
 def verdict(best: Judged | None, paper: Judged | None, none: float) -> tuple[str, str]:
-    """One of "better", "not better", "unverified", "no comparison", and a sentence that says so.
+    """One of "better", "not better", "infeasible", "unverified", "no comparison", and a sentence.
 
     Args:
         best: the best of the search.
@@ -180,11 +204,22 @@ def verdict(best: Judged | None, paper: Judged | None, none: float) -> tuple[str
             "Every rollout of a proposed layout on the reference solver failed: nothing found can "
             "be recommended."
         )
+    if not best.feasible:
+        names = " and ".join(k for k, v in (best.verified_excess or {}).items() if v > 0)
+        return "infeasible", (
+            f"No verified layout keeps every limit: the best breaks {names}. Allow more there, or "
+            "larger or more baffles, or search with a larger budget."
+        )
     relative = _change(best.verified_cost, none)
     if paper is None or paper.verified_cost is None:
         return "no comparison", (
             f"Verified cost {best.verified_cost:.4f}, {relative} no baffles; there is no layout of "
             "the scene's own to compare with."
+        )
+    if not paper.feasible:
+        return "better", (
+            f"The best layout found keeps every limit, which the scene's own does not: verified "
+            f"cost {best.verified_cost:.4f}, {relative} no baffles."
         )
     costs = f"verified cost {best.verified_cost:.4f} against {paper.verified_cost:.4f}"
     if best.verified_cost < paper.verified_cost:

@@ -5,6 +5,7 @@ The env, the searches and the verification all hold a task and differ in which l
 
 from __future__ import annotations
 
+import copy
 import math
 import os
 from collections.abc import Sequence
@@ -26,6 +27,8 @@ from gns_model.trajectory import DIVERGED, INTERRUPTED, OK, Trajectory
 #: A rollout has failed in which more than this share of the points enters a baffle or ends more
 #: than LEAK_DEPTH [m] outside the domain; so has one that throws a grain a domain's length away.
 LEAK_SHARE, LEAK_DEPTH = 0.05, 0.01
+#: Forms of baffles that a task remembers.
+MOST_FORMS = 256
 #: Status of such a rollout, beside those of `gns_model.trajectory`.
 LEAKED = "leaked"
 
@@ -110,6 +113,31 @@ class BaffleTask:
         self.cache = RolloutCache() if cache is None else cache
         self._scene_key = scene_key(simulator, self.scene)
         self._free: Outcome | None = None  # of the flow without baffles: always needed
+        self._nominal = self
+        self._forms: dict[tuple[float, ...], BaffleTask] = {}
+
+    def with_form(self, size: Sequence[float], yaw: float = 0.0) -> BaffleTask:
+        """The same task with baffles of another size [m], shape (D,), and yaw [degrees].
+
+        Costs stay relative to the same flow without baffles, in whose windows, as wide as this
+        task's own baffles, the free depth is read: so forms can be compared. What may be placed
+        where (`space`) stays that of this task's own form.
+        """
+        key = (*map(float, size), float(yaw))
+        own = self._nominal
+        if np.allclose(key, (*own.scene.baffle_size, own.scene.baffle_yaw), rtol=0, atol=1e-12):
+            return own
+        if key not in own._forms:
+            placement = self.space.placement.model_copy(
+                update={"size": key[:-1], "yaw": key[-1] or None}
+            )
+            other = copy.copy(own)
+            other.scene = own.scene.replace(placement=placement)
+            other._scene_key = scene_key(own.simulator, other.scene)
+            if len(own._forms) >= MOST_FORMS:
+                own._forms.clear()
+            own._forms[key] = other
+        return own._forms[key]
 
     @property
     def objective(self) -> Objective:
@@ -123,7 +151,7 @@ class BaffleTask:
         Raises:
             ObjectiveError: if that rollout fails, for then nothing can be relative to it.
         """
-        return self.evaluate([self.space.as_centres([])])[0].measures
+        return self._nominal.evaluate([self.space.as_centres([])])[0].measures
 
     def scene_with(self, centres: ArrayLike) -> Scene:
         """The scene with baffles at `centres` [m], shape (k, D-1)."""
@@ -167,13 +195,14 @@ class BaffleTask:
         Raises:
             ObjectiveError: as `evaluate`.
         """
-        assert self._free is not None, "simulate() finds the free flow first"
-        if self._free.status != OK:
+        free = self._nominal._free
+        assert free is not None, "simulate() finds the free flow first"
+        if free.status != OK:
             raise ObjectiveError(
                 f"the rollout of {self.simulator.name} without baffles ended as "
-                f"{self._free.status!r}, so no cost can be relative to it"
+                f"{free.status!r}, so no cost can be relative to it"
             )
-        reference = self._free.measures
+        reference = free.measures
         costs = tuple(
             objective.cost(outcome.measures, reference)
             if outcome.status == OK
@@ -220,7 +249,7 @@ def simulate(
     """
     nothing = [
         (task, task.space.as_centres([]))
-        for task in {id(task): task for task, _ in wanted}.values()
+        for task in {id(task._nominal): task._nominal for task, _ in wanted}.values()
         if task._free is None
     ]
     found: dict[bytes, tuple[Outcome, Trajectory | None]] = {}
@@ -243,8 +272,8 @@ def simulate(
         for (key, (task, _)), trajectory in zip(missing.items(), results, strict=True):
             outcome = _read(trajectory)
             kept = _kept(trajectory, keep)
-            task.rollouts += 1
-            task.failures += outcome.status != OK
+            task._nominal.rollouts += 1
+            task._nominal.failures += outcome.status != OK
             found[key] = outcome, kept
             if outcome.status != INTERRUPTED:  # another time it may run to its end
                 task.cache.remember(key, outcome, keep, kept)

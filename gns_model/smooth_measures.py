@@ -121,6 +121,42 @@ def smooth_upstream_depth(
     return smooth_maximum(depth.flatten(), _MAXIMUM * temperature)
 
 
+def smooth_overtopping(
+    positions: Tensor,
+    scene: Scene,
+    centres: Tensor,
+    size: Tensor,
+    yaw: float | Tensor = 0.0,
+    *,
+    temperature: float = TEMPERATURE,
+) -> Tensor:
+    """Share of the points that went over the top of a baffle in some frame, smooth [-].
+
+    Every face of the column of air over a baffle becomes a sigmoid; of a point the frame and the
+    baffle count where it is deepest in such a column.
+
+    Args:
+        positions: moving points over time [m], shape (T, N, D).
+        scene: its base; its own baffles are not looked at.
+        centres: plan centres of the baffles [m], shape (B, D-1).
+        size: of the baffles [m], shape (D,); yaw: of all [degrees].
+        temperature: blur [m], positive.
+    """
+    if len(centres) == 0:
+        return positions.new_zeros(())
+    edge = _EDGE * temperature
+    plan = positions[..., [0, *range(2, scene.dim)]][:, None] - centres[:, None]
+    if scene.dim == 3:
+        turn = torch.deg2rad(torch.as_tensor(yaw).to(positions))
+        cosine, sine = torch.cos(turn), torch.sin(turn)
+        x, z = plan.unbind(-1)
+        plan = torch.stack([x * cosine + z * sine, z * cosine - x * sine], dim=-1)
+    half = size[[0, *range(2, scene.dim)]] / 2
+    over = torch.sigmoid((positions[:, None, :, 1] - scene.base - size[1]) / edge)
+    inside = torch.sigmoid((half - plan.abs()) / edge).prod(dim=-1)
+    return (over * inside).amax(dim=(0, 1)).mean()
+
+
 def window_weights(
     positions: Tensor,
     centres: Tensor,

@@ -1,8 +1,9 @@
 """A flume whose physics is a formula, so that a search can be tested in milliseconds.
 
 The grains of a release slide down the flume; every baffle shortens the travel of the grains that
-meet it, most at one best place. It answers `rollout` and `rollout_tensor`, as a simulator does, and
-is smooth in the layout. Real simulators are used in test_run.py and test_cli.py.
+meet it, of more the wider it is, most at one best place. It answers `rollout` and `rollout_tensor`,
+as a simulator does, and is smooth in the layout. Real simulators are used in test_run.py and
+test_cli.py.
 """
 
 from types import SimpleNamespace
@@ -59,7 +60,8 @@ class FormulaSimulator:
         for scene in scenes:
             self.seen.append(scene)
             centres = torch.tensor([b.center for b in scene.baffles], dtype=torch.float64)
-            positions = self._positions(scene, centres.reshape(-1, scene.dim - 1)).numpy()
+            across = torch.tensor([b.size[-1] for b in scene.baffles], dtype=torch.float64)
+            positions = self._positions(scene, centres.reshape(-1, scene.dim - 1), across).numpy()
             trajectories.append(
                 Trajectory(
                     positions=positions,
@@ -73,18 +75,20 @@ class FormulaSimulator:
             )
         return trajectories
 
-    def _positions(self, scene, centres):
+    def _positions(self, scene, centres, across):
         start = torch.as_tensor(fill(scene, self.config.spacing).positions)
-        meets = torch.exp(-(((start[:, None, 2] - centres[None, :, 1]) / 0.25) ** 2))
+        meets = torch.exp(-(((start[:, None, 2] - centres[None, :, 1]) / (0.1 + across)) ** 2))
         near = torch.exp(-(((centres[:, 0] - BEST_X) / 0.3) ** 2))
         held = 1 - torch.prod(1 - 0.5 * meets * near, dim=1)
         shift = torch.linspace(0, 1, FRAMES, dtype=start.dtype)[:, None] * (0.9 - 0.6 * held)
         return torch.cat([(start[:, 0] + shift)[..., None], start[:, 1:].expand(FRAMES, -1, 2)], -1)
 
-    def rollout_tensor(self, scenes, centres=None, **options):
+    def rollout_tensor(self, scenes, centres=None, *, sizes=None, yaws=None, **options):
+        if sizes is None:
+            sizes = [torch.tensor([b.size for b in scene.baffles]) for scene in scenes]
         return [
-            self._positions(scene, c.to(torch.float64))
-            for scene, c in zip(scenes, centres, strict=True)
+            self._positions(scene, c.to(torch.float64), size[:, -1].to(torch.float64))
+            for scene, c, size in zip(scenes, centres, sizes, strict=True)
         ]
 
 
@@ -103,7 +107,7 @@ def campaign(folder, *, simulator=None, scene=None, n=2, resume=False, **options
     scene = scene or formula_scene()
     simulator = simulator or FormulaSimulator()
     task = BaffleTask(scene, simulator, n_baffles=n, objective=Objective(depth_weight=0.0))
-    log = TrialLog.open(
-        sqlite_url(folder / "study.db"), "test", task.space, {"n": n}, resume=resume, owned=True
-    )
-    return Campaign(log=log, evaluator=InProcess(task), **{"budget": 20, **options})
+    evaluator = InProcess(task)
+    url = sqlite_url(folder / "study.db")
+    log = TrialLog.open(url, "test", evaluator.space, {"n": n}, resume=resume, owned=True)
+    return Campaign(log=log, evaluator=evaluator, **{"budget": 20, **options})
