@@ -5,6 +5,7 @@ from __future__ import annotations
 from html import escape
 
 from design import page, wording
+from design.constraints_page import not_kept, stated
 from design.drawing import coordinates, layout_drawing, legend
 from design.results import Design, RunResults
 
@@ -29,7 +30,7 @@ def answer(run: RunResults, name: str) -> str:
     title, lead = _headline(run, best, count)
     parts = [head, f"<h1>{title}</h1>", f'<p class="lead">{lead}</p>', _missing(run), _notes(run)]
     if run.scene is not None and best.centres is not None:
-        placed = run.scene.with_baffles(best.centres)
+        placed = best.placed(run.scene)
         own = run.scene if run.scene.baffles else None
         drawing = layout_drawing(run.scene, placed, own)
         parts.append(
@@ -44,6 +45,8 @@ def _badge(run: RunResults, best: Design | None) -> tuple[str, str]:
     if best is None:
         return "warn", "No result"
     if best.verified:
+        if not_kept(run):
+            return "warn", "Verified · breaks a limit"
         if _judgement(best, run.design("paper")) in ("worse", "same"):
             return "warn", "Verified · not better than the scene's own layout"
         return "ok", "Verified by the reference solver"
@@ -99,6 +102,10 @@ def _headline(run: RunResults, best: Design, count: int) -> tuple[str, str]:
             f"The flow gets up to {quantity['upstream_depth'].text(depth)} deep before a baffle"
             f"{_against(gain, 'with the scene’s own layout', name='upstream_depth')}."
         )
+    broken = not_kept(run)
+    if broken:
+        names = " and ".join(f"{escape(c['title'])} ({stated(c)})" for c in broken)
+        sentences.append(f"<strong>It does not keep every limit:</strong> {names}.")
     if not verified and not best.status:
         sentences.append(
             "<strong>These numbers are predictions.</strong> The reference solver has not seen "

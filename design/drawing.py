@@ -113,8 +113,8 @@ def coordinates(run: RunResults, placed: Scene) -> str:
         for k, baffle in enumerate(placed.baffles, start=1)
     ]
     size, yaw = placed.baffles[0].size, placed.baffles[0].yaw
-    text = f"{size[0]:g} m along x, {size[1]:g} m high" + (
-        "" if plane else f", {size[2]:g} m across"
+    text = f"{size[0]:.4g} m along x, {size[1]:.4g} m high" + (
+        "" if plane else f", {size[2]:.4g} m across"
     )
     if len({baffle.yaw for baffle in placed.baffles}) > 1:
         head.append("yaw [°]")
@@ -128,7 +128,8 @@ def coordinates(run: RunResults, placed: Scene) -> str:
     clear = f"<br>Least clear distance between two: {gaps:.3f} m." if gaps is not None else ""
     return (
         f"{page.table(head, rows)}<p class='fine'>"
-        f"Each {text}. Volume in all {volume:.3g} {unit}.{clear}<br>As files: {_links(run)}.</p>"
+        f"Each {text}. Concrete of {len(placed.baffles)} in all: {volume:.3g} {unit}.{clear}"
+        f"<br>As files: {_links(run)}.</p>"
     )
 
 
@@ -193,6 +194,9 @@ def _placement(paper: Paper) -> list[str]:
         paper.rectangle(rectangle[:2], rectangle[2:], 'class="keep-out" fill="url(#hatch)"')
         for rectangle in placement.keep_out
     ]
+    for zone in placement.keep_out_polygons:
+        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in map(paper.at, zone))
+        parts.append(f'<polygon points="{points}" class="keep-out" fill="url(#hatch)"/>')
     return [paper.rectangle(placement.lower, placement.upper, 'class="placement"'), *parts]
 
 

@@ -145,17 +145,21 @@ def choice(run: RunResults, pictures: Pictures) -> str:
             )
         )
     layouts = [(d, d.centres) for d in run.designs if d.centres is not None]
+    formed = any(d.size for d, _ in layouts)
     if run.scene is not None and layouts:
         known = {q.name: q for q in wording.quantities(run.scene)}
         rows = []
         for design, layout in layouts:
             kind = {"best": "best", "paper": "ownfill"}.get(design.key, "ranked")
-            placed = run.scene.with_baffles(layout)
+            placed = design.placed(run.scene)
             values = design.verified or design.surrogate
             mark = "" if design.verified else " *"
             centres = " ".join(
                 f'<span class="nowrap">({", ".join(f"{v:.3f}" for v in c)})</span>' for c in layout
             )
+            if formed and placed.baffles:
+                size = " × ".join(f"{v:.3f}" for v in placed.baffles[0].size)
+                centres += f'<br><span class="nowrap">each {size} m</span>'
             label = f'<span class="key">{escape(design.label)}</span><small>{centres}</small>'
             rows.append(
                 [

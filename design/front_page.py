@@ -37,7 +37,11 @@ def pareto(run: RunResults, pictures: dict[str, tuple[bytes, bytes]]) -> str:
         )
     rows = []
     for e in entries:
-        placed = run.scene.with_baffles(e["layout"]) if run.scene is not None else None
+        placed = (
+            run.scene.with_baffles(e["layout"], size=e.get("size"), yaw=e.get("yaw"))
+            if run.scene is not None
+            else None
+        )
         drawn = thumbnail(run.scene, placed, "ranked") if run.scene and placed else ""
         centres = " ".join(
             f'<span class="nowrap">({", ".join(f"{v:.3f}" for v in c)})</span>' for c in e["layout"]

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from design import animation, page
 from design.answer import answer, gains
+from design.constraints_page import kept
 from design.evidence import Pictures, choice, flow, search, trust
 from design.figures import write_figures
 from design.front_page import pareto, scenarios
@@ -45,6 +46,7 @@ def render(run: RunResults, pictures: Pictures) -> str:
     parts = [
         answer(run, name),
         gains(run),
+        kept(run),
         flow(run, pictures),
         trust(run, pictures),
         pareto(run, pictures),

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from design.space import FORM
 from gns_model import measures
 from gns_model.errors import GnsError
 from gns_model.scene import Scene
@@ -47,6 +48,7 @@ class Design:
         verified_cost: objective by the reference solver, or None.
         origin: which part of the search proposed it.
         status: how the solver's rollout ended, "" where it has not run.
+        size, yaw: of its baffles [m], [degrees], where the search chose them.
         spread: of the ensemble, by measure; empty where there is none.
         marks: why the learned simulator may be out of its depth here.
         model: the refined model that found it, "" for the one that was given.
@@ -61,20 +63,35 @@ class Design:
     verified_cost: float | None = None
     origin: str = ""
     status: str = ""
+    size: tuple[float, ...] | None = None
+    yaw: float | None = None
     spread: dict[str, float] = field(default_factory=dict)
     marks: list[str] = field(default_factory=list)
     model: str = ""
 
+    def placed(self, scene: Scene) -> Scene:
+        """`scene`, that of the run, with these baffles.
+
+        Raises:
+            SceneError: if they do not fit into it.
+        """
+        if self.key == "paper":
+            return scene
+        centres = np.zeros((0, scene.dim - 1)) if self.centres is None else self.centres
+        return scene.with_baffles(centres, size=self.size, yaw=self.yaw)
+
 
 @dataclass
 class Trial:
-    """One rollout of the search; `cost` is None if it failed, `centres` [m] (n, D-1) or None."""
+    """One rollout of the search; `cost` is None if it failed, `centres` [m] (n, D-1) or None;
+    `form` is what the search chose of sizes [m] and yaw [degrees], by name."""
 
     number: int
     origin: str
     cost: float | None
     measures: dict[str, float]
     centres: np.ndarray | None = None
+    form: dict[str, float] = field(default_factory=dict)
 
 
 class RunResults:
@@ -135,6 +152,7 @@ class RunResults:
                             cost,
                             _numbers({k: row.get(k) for k in measures.UNITS}),
                             _placed(row),
+                            {n: v for n in FORM if (v := _number(row.get(n))) is not None},
                         )
                     )
         except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -150,6 +168,7 @@ class RunResults:
             # Interrupted before a summary: the table of trials still knows which was best.
             lowest = min(tried, key=lambda t: t.cost if t.cost is not None else math.inf)
             found[0].centres, found[0].cost = lowest.centres, lowest.cost
+            found[0].size, found[0].yaw = _form(lowest.form, self.scene)
             found[0].surrogate, found[0].origin = lowest.measures, lowest.origin
         rank = 1
         for entry in self.summary.get("ranked") or []:
@@ -214,6 +233,9 @@ class RunResults:
         layout = entry.get("layout")
         if isinstance(layout, list):
             design.centres = _centres(layout)
+        if isinstance(entry.get("size"), list):
+            design.size = tuple(map(float, entry["size"]))
+            design.yaw = _number(entry.get("yaw")) or 0.0
         design.cost = _number(entry.get("cost"))
         design.verified_cost = _number(entry.get("verified_cost"))
         design.origin = str(entry.get("origin") or "")
@@ -233,6 +255,16 @@ class RunResults:
                     if design.centres is None:
                         design.centres = _centres([b.center for b in trajectory.scene.baffles])
         return design
+
+
+def _form(
+    chosen: dict[str, float], scene: Scene | None
+) -> tuple[tuple[float, ...] | None, float | None]:
+    """Size and yaw of which some were chosen, the others as in the scene."""
+    if not chosen or scene is None:
+        return None, None
+    size = tuple(chosen.get(name, own) for name, own in zip(FORM, scene.baffle_size, strict=False))
+    return size, chosen.get("yaw", scene.baffle_yaw)
 
 
 def _number(value: Any) -> float | None:
