@@ -51,8 +51,9 @@ parser.add_argument("--seeds", type=int, default=5, help="runs of each method in
 parser.add_argument("--first-seed", type=int, default=0)
 parser.add_argument("--batch", type=int, default=4, help="layouts proposed at a time")
 parser.add_argument(
-    "--duration", type=float, default=0.6, help="of the flows [s]; both rest by then (0.9 s given)"
+    "--duration", type=float, default=0.5, help="of the flows [s], which rest near 0.6 s"
 )
+parser.add_argument("--precision", default="bfloat16", help="of the products over edges")
 parser.add_argument("--simulator", default="baffle-lite", help="a shipped model or a path")
 parser.add_argument("--jobs", type=int, default=1, help="one-thread processes")
 parser.add_argument("--csv", type=Path, help="where to put all runs together; default: in --out")
@@ -134,12 +135,13 @@ def run_all(arguments: argparse.Namespace, scene: str, seed: int) -> list[str]:
     from design.trials import TrialLog
     from gns_env.task import BaffleTask
     from gns_model.scene import Scene, write_whole
+    from gns_model.simulator import load_simulator
 
     torch.set_num_threads(1)
     given = Scene.from_toml(scene)
     task = BaffleTask(
         given.replace(duration=arguments.duration),
-        arguments.simulator,
+        load_simulator(arguments.simulator, precision=arguments.precision),
         n_baffles=len(given.baffles),
     )
     evaluator = Remembering(task, arguments.out / f"{Path(scene).stem}.jsonl")
@@ -177,7 +179,7 @@ def same_settings(arguments: argparse.Namespace) -> None:
     """Write down what the runs in --out have in common, or refuse to add others to them."""
     from gns_model.scene import write_whole
 
-    names = ("budget", "batch", "duration", "simulator")
+    names = ("budget", "batch", "duration", "simulator", "precision")
     settings = {name: getattr(arguments, name) for name in names}
     file = arguments.out / "settings.json"
     if not file.exists():

@@ -55,6 +55,7 @@ class Slide:
         *,
         frames: int | None = None,
         limit: float | None = None,
+        smoothing: float = 0.0,
     ) -> list[torch.Tensor]:
         out = []
         for scene, where in zip(scenes, centres, strict=True):
