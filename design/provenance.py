@@ -16,6 +16,7 @@ FILES = (
     ("**/*.stl", "the baffles as closed solids; metres, z up"),
     ("**/*.glb", "baffles, base and release for a 3D viewer; y up"),
     ("front.csv", "the Pareto front: objectives, measures and places of every point"),
+    ("refined-*/model.safetensors", "the refined model; its folder is a --simulator"),
     ("trials.csv", "every rollout of the search"),
     ("summary.json", "the numbers of this page"),
     ("study.db", "the search itself, an Optuna study: optuna-dashboard opens it"),
@@ -76,11 +77,17 @@ def _command(run: RunResults) -> str:
         "objective.runout_weight": "runout-weight",
         "objective.depth_weight": "depth-weight",
         "objective.mass_weight": "mass-weight",
+        "ensemble": "ensemble",
+        "refine": "refine-rounds",
+        "refine_minutes": "refine-minutes",
+        "refine_data": "refine-data",
     }
     words = ["gns-design", "optimize", str(run.folder / "scene.toml")]
     for key, option in options.items():
         if settings.get(key) is not None:
             words += [f"--{option}", str(settings[key])]
+    if settings.get("refine"):
+        words.append("--refine")
     return shlex.join([*words, "--out", f"{run.folder}-again"])
 
 

@@ -6,6 +6,7 @@ import re
 import pytest
 
 from design.evidence import trust
+from design.provenance import reproduce
 from design.results import RunResults
 from design.trust import trust_lines
 
@@ -96,3 +97,16 @@ def test_the_terminal_says_the_same(folder):
     assert "is 1.7 %, by baffle-lite 4.1 %" in lines[1]
     assert "4 layouts that it found afterwards" in lines[2]
     assert "is 4.1 %, by baffle-lite 4.1 %" in lines[2]
+
+
+def test_the_command_for_the_same_run_names_members_and_rounds(folder, tmp_path):
+    summary = json.loads((folder / "summary.json").read_text())
+    wanted = {"ensemble": "a,b", "refine": 2, "refine_minutes": 3.0, "refine_data": "data/old"}
+    summary["settings"] |= wanted
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    (tmp_path / "scene.toml").write_text((folder / "scene.toml").read_text())
+    said = text(reproduce(RunResults(tmp_path)))
+    options = (
+        "--ensemble a,b --refine-rounds 2 --refine-minutes 3.0 --refine-data data/old --refine"
+    )
+    assert options in said
