@@ -116,6 +116,11 @@ class BuildableSampler(optuna.samplers.BaseSampler):
     ) -> None:
         self._model, self._log, self._rng = model, log, rng
 
+    def before_trial(self, study: optuna.Study, trial: FrozenTrial) -> None:
+        """A proposal takes a while: others are to know that somebody is at it."""
+        self._log.hold(trial.number, trial._trial_id)
+        self._model.before_trial(study, trial)
+
     def infer_relative_search_space(
         self, study: optuna.Study, trial: FrozenTrial
     ) -> dict[str, BaseDistribution]:

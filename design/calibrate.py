@@ -142,6 +142,7 @@ def summary(found: Found, wanted: Unknown) -> dict[str, Any]:
         "rollouts_by_differences": found.rollouts_by_differences,
         "seconds": round(found.seconds, 2),
         "at_bound": bool(found.at_bound),
+        "history": [{"value": value, "distance": distance} for value, distance in found.history],
     }
 
 

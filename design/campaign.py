@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -11,6 +13,9 @@ import optuna
 
 from design.space import Space
 from design.trials import Outcome, Proposal, Trial, TrialLog
+
+#: How often a worker without budget looks whether the others have ended [s].
+LOOK = 1.0
 
 
 class Evaluator(Protocol):
@@ -69,8 +74,9 @@ class Campaign:
         return self.budget // self.price
 
     def spent(self) -> int:
-        """Passes through a layout so far, also those of an earlier run that is resumed."""
-        return self.log.spent() // self.price
+        """Passes through a layout so far, also those of an earlier run that is resumed and those
+        that other workers on the study have spent or are spending."""
+        return self.log.taken(self.price) // self.price
 
     def left(self) -> int:
         """Passes through a layout still to spend."""
@@ -85,27 +91,78 @@ class Campaign:
         self, count: int, sampler: optuna.samplers.BaseSampler, origin: str
     ) -> list[Trial]:
         """Ask for `count` layouts, run them, tell their outcomes as they come."""
-        proposals: list[Proposal] = []
-        trials = []
-        try:
-            proposals = self.log.ask(count, sampler, origin)
-            for k, outcome in self.evaluator.evaluate([p.centres for p in proposals]):
-                trials.append(self.log.tell(proposals[k], outcome))
-                self.on_trial(trials[-1])
-        finally:
-            self.log.abandon()
-        return trials
+        self.catch_up()
+        count = min(count, self.left())
+        return self._run(lambda: self.log.ask(count, sampler, origin), self.evaluator.evaluate)
 
     def run(self, layouts: Sequence[tuple[str, np.ndarray]]) -> None:
         """Run layouts (origin, centres [m]), a batch at a time, as far as the budget goes."""
         layouts = list(layouts)
-        while layouts and (left := self.left()) > 0:
+        while layouts and (left := self._left_after_others()) > 0:
             now, layouts = layouts[: min(self.batch, left)], layouts[min(self.batch, left) :]
-            for k, outcome in self.evaluator.evaluate([centres for _, centres in now]):
-                self.record(*now[k], outcome)
+            given = [centres for _, centres in now]
+            ask = partial(self.log.reserve, now, self.price)
+            self._run(ask, self.evaluator.evaluate, given)
 
-    def record(self, origin: str, centres: np.ndarray, outcome: Outcome) -> Trial:
-        """Put a layout that the log did not ask for on record."""
-        trial = self.log.add(origin, centres, outcome)
-        self.on_trial(trial)
-        return trial
+    def differentiate(self, origin: str, layouts: Sequence[np.ndarray]) -> dict[int, Outcome]:
+        """Run layouts [m], shape (n, D-1), forward and backward; outcomes by index, without those
+        that another worker runs just now."""
+        found: dict[int, Outcome] = {}
+        self._run(
+            lambda: self.log.reserve([(origin, c) for c in layouts], 2 * self.price),
+            self.evaluator.differentiate,
+            layouts,
+            found,
+        )
+        return found
+
+    def catch_up(self) -> None:
+        """Run what workers that died, or an earlier run, asked for and did not tell."""
+        while self._run(lambda: self.log.again(self.batch), self.evaluator.evaluate):
+            pass
+
+    def wait(self, watch: Callable[[int], None] = lambda trials: None) -> bool:
+        """Wait until no other worker runs a trial, and take over from those that die.
+
+        Returns:
+            whether budget came back that the search may spend.
+        """
+        left = self.left()
+        while True:
+            self.catch_up()
+            if self.left() > left:
+                return True
+            others = self.log.others()
+            watch(len(others))
+            if not others:
+                return False
+            time.sleep(LOOK)
+
+    def _left_after_others(self) -> int:
+        self.catch_up()
+        return self.left()
+
+    def _run(
+        self,
+        ask: Callable[[], list[Proposal]],
+        evaluate: Callable[[Sequence[np.ndarray]], Iterator[tuple[int, Outcome]]],
+        given: Sequence[np.ndarray] | None = None,
+        found: dict[int, Outcome] | None = None,
+    ) -> list[Trial]:
+        """Ask, run and tell; `given`: the layouts as they are to be run, with their baffles in the
+        order that they were given. `found`: outcomes by index."""
+        trials = []
+        try:
+            proposals = ask()
+            admitted = self.log.admit(proposals, self.budget, self.price) if proposals else []
+            indices = [k for k, proposal in enumerate(admitted) if proposal is not None]
+            layouts = [proposals[k].centres if given is None else given[k] for k in indices]
+            for n, outcome in evaluate(layouts) if layouts else ():
+                k = indices[n]
+                trials.append(self.log.tell(proposals[k], outcome))
+                if found is not None:
+                    found[k] = outcome
+                self.on_trial(trials[-1])
+        finally:
+            self.log.abandon()
+        return trials

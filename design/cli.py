@@ -173,11 +173,22 @@ def optimize(
     storage: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option(
-            help="Optuna storage address, to share a search between machines; default: SQLite in "
-            "the run folder.",
+            help="Address of a database, such as postgresql://user@host/database: workers that are "
+            "given the same one share the search and its budget, each with an --out of its own; "
+            "default: SQLite in the run folder.",
             show_default=False,
         ),
     ] = None,
+    study: Annotated[
+        str, typer.Option(help="Name of the study in --storage, one for each problem.")
+    ] = "gns-design",
+    grace: Annotated[
+        int,
+        typer.Option(
+            help="Seconds without a sign of life after which the trials of another worker on "
+            "--storage are tried again."
+        ),
+    ] = 60,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with what the run folder and storage hold.")
     ] = False,
@@ -244,11 +255,16 @@ def optimize(
             verify=verify,
             seed=seed,
             simulator=simulator_spec(simulator, spacing, device),
-            verifier=simulator_spec(verify_with, verify_spacing, device),
+            # The reference solver judges beside the search, on the cores that a GPU leaves free.
+            verifier=simulator_spec(
+                verify_with, verify_spacing, "cpu" if verify_with == "mpm" else device
+            ),
             objective=objective_of(
                 runout_weight=runout_weight, depth_weight=depth_weight, mass_weight=mass_weight
             ),
             storage=storage,
+            study=study,
+            grace=grace,
             resume=resume,
             workers=workers,
             batch=batch,

@@ -93,13 +93,14 @@ def descend(
 ) -> None:
     """Step all chains together from `starts` [m], shape (n, D-1), within `budget` passes."""
     chains = [kind(campaign.space, start) for start in starts]
-    while chains and budget >= 2:
+    while chains and (budget := min(budget, campaign.left())) >= 2:
         chains = chains[: budget // 2]
         budget -= 2 * len(chains)
-        layouts = [chain.centres for chain in chains]
-        for k, outcome in campaign.evaluator.differentiate(layouts):
-            campaign.record("gradient", layouts[k], outcome)
-            chains[k].learn(outcome)
+        outcomes = campaign.differentiate("gradient", [chain.centres for chain in chains])
+        # What another worker runs just now is the other's chain.
+        chains = [chain for k, chain in enumerate(chains) if k in outcomes]
+        for chain, k in zip(chains, sorted(outcomes), strict=True):
+            chain.learn(outcomes[k])
         chains = [chain for chain in chains if chain.step >= LEAST_STEP]
 
 

@@ -54,6 +54,7 @@ def leap(campaign: Campaign, chains: Sequence[Chain] = ()) -> list[Chain]:
         return living
     if not living or trials[0].outcome.merit < min(chain.best_cost for chain in living):
         leapt = [t.centres for t in trials if t.origin == "gradient"]
+        leapt += campaign.log.at_work("gradient")  # by another worker
         count = min(CHAINS, max(campaign.passes // PASSES_A_CHAIN, 1))
         origins = apart([t.centres for t in trials], STEP, count, avoid=leapt)
         living = [Adam(campaign.space, origin) for origin in origins]
@@ -61,12 +62,13 @@ def leap(campaign: Campaign, chains: Sequence[Chain] = ()) -> list[Chain]:
     while living and paying and campaign.left() >= 2:
         living = living[: campaign.left() // 2]
         before = [chain.best_cost for chain in living]
-        layouts = [chain.centres for chain in living]
-        for k, outcome in campaign.evaluator.differentiate(layouts):
-            campaign.record("gradient", layouts[k], outcome)
-            living[k].learn(outcome)
-        paying = any(b - c.best_cost > GAIN for b, c in zip(before, living, strict=True))
-        living = [chain for chain in living if chain.step >= LEAST_STEP]
+        outcomes = campaign.differentiate("gradient", [chain.centres for chain in living])
+        # What another worker runs just now is the other's chain.
+        mine = [(before[k], living[k]) for k in sorted(outcomes)]
+        for (_, chain), k in zip(mine, sorted(outcomes), strict=True):
+            chain.learn(outcomes[k])
+        paying = any(b - chain.best_cost > GAIN for b, chain in mine)
+        living = [chain for _, chain in mine if chain.step >= LEAST_STEP]
     return living
 
 

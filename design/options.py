@@ -26,7 +26,10 @@ Weight = Annotated[
         show_default=False,
     ),
 ]
-Device = Annotated[str, typer.Option(help="torch device of a learned simulator: cpu or cuda.")]
+Device = Annotated[
+    str,
+    typer.Option(help="torch device of the simulator: cpu or cuda; mpm has a solver for each."),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress.")]
 
@@ -40,9 +43,7 @@ def simulator_spec(name: str, spacing: float | None, device: str) -> SimulatorSp
     from design.evaluators import SimulatorSpec
     from gns_model.errors import SimulatorError
 
-    if name == "mpm":
-        return SimulatorSpec(name, options=() if spacing is None else (("spacing", spacing),))
-    if spacing is not None:
+    if name != "mpm" and spacing is not None:
         raise SimulatorError(f"a spacing can be chosen for mpm only; {name} has its own")
     import torch
 
@@ -52,7 +53,7 @@ def simulator_spec(name: str, spacing: float | None, device: str) -> SimulatorSp
         raise SimulatorError(f"no device {device!r}: give cpu or cuda") from None
     if kind not in ("cpu", "cuda") or (kind == "cuda" and not torch.cuda.is_available()):
         raise SimulatorError(f"device {device!r} is not there: give cpu, or cuda on a GPU machine")
-    return SimulatorSpec(name, device=device)
+    return SimulatorSpec(name, device, () if spacing is None else (("spacing", spacing),))
 
 
 def objective_of(**weights: float | None) -> Objective:

@@ -101,7 +101,8 @@ def refine(run: Run, store: RolloutStore, workers: Workers, watch: Watch) -> Non
         inner = Run(
             run.scene,
             folder,
-            replace(s, simulator=refined, refine=0, resume=True),
+            # A refined model is this worker's own, so its search is shared with nobody.
+            replace(s, simulator=refined, refine=0, resume=True, storage=None),
             run.command,
             continued=Continued(
                 run.ensemble,
@@ -114,7 +115,7 @@ def refine(run: Run, store: RolloutStore, workers: Workers, watch: Watch) -> Non
         # A resumed round reads what its search is relative to.
         run.kept |= {p.result().path for pending in searched.values() for p in pending}
         inner.write(COMPLETE)
-        inner.log.close()
+        inner.close()
         found = [j for j in inner.ranked if not among(j.centres, [k.centres for k in known])]
         for judged in found:
             judged.model = folder.name

@@ -20,9 +20,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import os
-import socket
 import time
 import warnings
 from collections.abc import Iterator, Sequence
@@ -39,6 +37,7 @@ from design.distinct import among
 from design.ensemble import POOL, Ensemble, Panel, beyond_limits
 from design.evaluators import InProcess, InWorkers, SimulatorSpec, TaskSpec, failure_cost
 from design.evaluators import differentiable as has_gradient
+from design.folder import claim, release, same_scene
 from design.front import front_entries, relative, write_front
 from design.methods import METHODS, choose
 from design.pareto import front, spread
@@ -48,6 +47,7 @@ from design.rules import Rules
 from design.scenarios import Scenarios, scenes, widest
 from design.settings import Settings
 from design.space import DesignSpace, Form, Space, built, design_space, form_of, numbers, split
+from design.storage import StudyError, public, sqlite_url, storage_errors
 from design.store import Pending, Rolled, RolloutStore, Watch
 from design.summary import (
     COMPLETE,
@@ -59,7 +59,7 @@ from design.summary import (
     write_summary,
     write_trials,
 )
-from design.trials import Outcome, StudyError, Trial, TrialLog, sqlite_url, storage_errors
+from design.trials import Outcome, Trial, TrialLog, worker
 from design.verify import Judged, as_judged, candidates, rank
 from design.workers import Workers, default_count
 from gns_env.scenario import Scenario
@@ -98,16 +98,18 @@ def optimise(
     run = Run(scene, Path(out), settings or Settings(), command)
     with storage_errors(run.storage):
         run.open()
-        with progress_bar(quiet=quiet) as bar:
-            with Workers(run.workers) as workers:
-                try:
-                    run.simulate(workers, bar)
-                except BaseException:
-                    with contextlib.suppress(Exception):  # the first error is the one to tell
-                        run.write(INTERRUPTED)
-                    raise
-            run.publish(bar)
-        run.log.close()
+        try:
+            with progress_bar(quiet=quiet) as bar:
+                with Workers(run.workers) as workers:
+                    try:
+                        run.simulate(workers, bar)
+                    except BaseException:
+                        with contextlib.suppress(Exception):  # the first error is the one to tell
+                            run.write(INTERRUPTED)
+                        raise
+                run.publish(bar)
+        finally:
+            run.close()
     return run.summary
 
 
@@ -135,7 +137,10 @@ class Run:
     ) -> None:
         self._began = time.perf_counter()
         scene = settings.applied(scene)
-        self.scene, self.out, self.settings, self.command = scene, out, settings, list(command)
+        self.scene, self.out, self.settings = scene, out, settings
+        # An address may carry a password, which is no part of a report.
+        given = settings.storage or ""
+        self.command = [c.replace(given, public(given)) if given else c for c in command]
         self.ranked: list[Judged] = []
         self.paper: Judged | None = None
         self.none: Judged | None = None
@@ -189,6 +194,7 @@ class Run:
         self.workers = settings.workers or max(1, min(default_count(), of_use))
         self.storage = settings.storage or sqlite_url(out / "study.db")
         self._log: TrialLog | None = None
+        self._lock: int | None = None
 
     @property
     def log(self) -> TrialLog:
@@ -210,7 +216,6 @@ class Run:
             raise StudyError(
                 f"{self.out} already holds a run: go on with --resume, or choose another --out"
             )
-        self.out.mkdir(parents=True, exist_ok=True)
         task: dict[str, Any] = {
             "scene": self.bare.to_dict(),
             "number of baffles": self.baffles,
@@ -226,18 +231,35 @@ class Run:
         if s.scenarios:
             task["set of scenarios"] = [asdict(flow) for flow in self.drawn]
             task["risk"] = asdict(s.risk)
-        # A storage that is shared holds many studies: the task tells them apart.
-        digest = hashlib.sha256(json.dumps(task, sort_keys=True).encode()).hexdigest()[:8]
-        name = f"{self.scene.name}-{digest}" if s.storage else "gns-design"
-        self._log = TrialLog.open(
-            self.storage,
-            name,
-            self.space,
-            task,
-            resume=s.resume,
-            owned=s.storage is None,
-            objectives=len(s.parts),
-        )
+        same_scene(self.out, self.scene)
+        new = not self.out.exists()
+        if s.storage is None:
+            self.out.mkdir(parents=True, exist_ok=True)
+        try:
+            if s.storage is None:
+                self._lock = claim(self.out)
+            self._log = TrialLog.open(
+                self.storage,
+                s.study,
+                self.space,
+                task,
+                resume=s.resume,
+                owned=s.storage is None,
+                objectives=len(s.parts),
+                grace=s.grace,
+            )
+            if s.storage is not None:  # a study that is refused leaves no folder
+                self.out.mkdir(parents=True, exist_ok=True)
+                self._lock = claim(self.out)
+        except BaseException:
+            if self._log is not None:
+                self._log.close()
+            if new:
+                with contextlib.suppress(OSError):  # not empty
+                    self.out.rmdir()
+            raise
+        if s.storage is not None and (there := len(self.log.trials())):
+            self._note(f"joined the study {s.study!r}, which held {there} trials")
         self.scene.to_toml(self.out / "scene.toml")
 
     def simulate(self, workers: Workers, bar: Progress) -> None:
@@ -293,6 +315,11 @@ class Run:
         bar.advance(task)
         self.write(COMPLETE)
 
+    def close(self) -> None:
+        """Leave the study and the run folder to others."""
+        self.log.close()
+        release(self._lock)
+
     def write(self, status: str) -> None:
         """summary.json, trials.csv and layouts/ from what there is so far."""
         s, trials = self.settings, self.log.trials()
@@ -325,7 +352,8 @@ class Run:
                 **_freed(s),
                 **({"scenarios": _described(s.scenarios)} if s.scenarios else {}),
                 **_trusted(s),
-                "storage": self.storage.rsplit("@", 1)[-1],
+                "storage": public(self.storage),
+                "study": s.study,
             },
             "versions": versions(),
         }
@@ -459,29 +487,32 @@ class Run:
 
     def _search(self, workers: Workers, references: Sequence[Rolled], watch: Watch) -> None:
         s, log = self.settings, self.log
-        tried = [t for t in log.trials() if t.ok]
         bar = watch.bar
         title = f"search: {self.method}"
-        task = bar.add_task(title, total=s.passes, completed=log.spent())
+        task = bar.add_task(title, total=s.passes)
 
-        def on_trial(trial: Trial) -> None:
-            if trial.ok:
-                # Only what may be best or on the front has to be remembered.
-                tried[:] = front([*tried, trial]) if s.objectives else [*tried, trial]
-                best = min(tried, key=lambda t: t.order)
-                said = f"best {best.cost:.4f}"
-                said += "" if best.outcome.feasible else ", which breaks a limit"
-                said = f"front of {len(tried)}, {said}" if s.objectives else said
-                bar.update(task, description=f"{title}, {said}")
-            bar.advance(task, trial.outcome.rollouts + trial.outcome.backwards)
+        def show(trial: Trial | None = None, waiting: int = 0) -> None:
+            tried = log.trials()  # also those of other workers
+            good = [t for t in tried if t.ok]
+            said = [title]
+            if good and s.objectives:
+                said.append(f"front of {len(front(good))}")
+            if good:
+                best = min(good, key=lambda t: t.order)
+                limits = "" if best.outcome.feasible else ", which breaks a limit"
+                said.append(f"best {best.cost:.4f}{limits}")
+            if waiting:
+                said.append(f"waiting for {waiting} trials of other workers")
+            bar.update(task, description=", ".join(said), completed=log.spent(tried))
 
+        show()
         campaign = Campaign(
             log=log,
             evaluator=self._evaluator(workers, [r.path for r in references], watch),
             budget=s.passes,
             seed=s.seed,
             batch=s.batch,
-            on_trial=on_trial,
+            on_trial=show,
             salt=_salt() if s.storage else 0,
             price=s.flows,
         )
@@ -490,6 +521,9 @@ class Run:
             fresh = [c for c in self.continued.first if not among(c, known)]
             campaign.run([("verified", c) for c in fresh])
         METHODS[self.method](campaign)
+        # The last trials of a study that is shared may be another worker's, or be left to us.
+        while campaign.wait(lambda waiting: show(waiting=waiting)):
+            METHODS[self.method](campaign)
 
     def _evaluator(self, workers: Workers, references: list[Path], watch: Watch) -> Evaluator:
         s = self.settings
@@ -659,5 +693,4 @@ def _trusted(settings: Settings) -> dict[str, Any]:
 
 def _salt() -> int:
     """A number of this process, for the random numbers of searches that share a study."""
-    place = f"{socket.gethostname()}-{os.getpid()}"
-    return int.from_bytes(hashlib.sha256(place.encode()).digest()[:4], "big")
+    return int.from_bytes(hashlib.sha256(worker().encode()).digest()[:4], "big")

@@ -48,7 +48,10 @@ class Settings:
             the front is recommended.
         objectives: names of `objectives.NAMES` for a Pareto front; none: one objective.
         scenarios: the flows that a layout has to stand; None: the scene's own.
-        storage: Optuna storage address; None: SQLite in the run folder.
+        storage: Optuna storage address, of a study that several workers may share; None: SQLite in
+            the run folder.
+        study: name of the study there.
+        grace: seconds without a sign of life after which another worker's trials are tried again.
         resume: go on with what the run folder and the storage hold.
         workers: processes of one thread; None: one a core, as many as are of use.
         batch: layouts proposed at a time.
@@ -77,6 +80,8 @@ class Settings:
     objectives: tuple[str, ...] = ()
     scenarios: Scenarios | None = None
     storage: str | None = None
+    study: str = "gns-design"
+    grace: int = 60
     resume: bool = False
     workers: int | None = None
     batch: int = 8
@@ -92,6 +97,7 @@ class Settings:
     def __post_init__(self) -> None:
         least = {"budget": 1, "verify": 0, "batch": 1, "seed": 0, "workers": 1, "baffles": 1}
         least["refine"] = 0
+        least["grace"] = 2
         for name, bound in least.items():
             value = getattr(self, name)
             if value is not None and value < bound:

@@ -12,28 +12,25 @@ import csv
 import io
 import json
 import os
-from collections.abc import Iterator, Sequence
+import socket
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import optuna
 from optuna.trial import FrozenTrial, TrialState
-from sqlalchemy import event
-from sqlalchemy.exc import SQLAlchemyError
 
+from design import ledger
 from design.distinct import distance
+from design.heart import Heart
 from design.parameters import distributions, ordered, plan_dim, to_centres, to_parameters
 from design.rules import PENALTY, broken
 from design.space import FORM, DesignSpace, Space
-from gns_model.errors import GnsError
+from design.storage import StudyError, open_storage, public, storage_errors
 
 optuna.logging.set_verbosity(optuna.logging.ERROR)
-
-
-class StudyError(GnsError):
-    """A study that cannot be opened, or that belongs to another task."""
 
 
 @dataclass(frozen=True)
@@ -115,12 +112,20 @@ class Proposal:
 
 
 class TrialLog:
-    """An Optuna study seen as layouts: ask for some, tell what they gave, look at all."""
+    """An Optuna study seen as layouts: ask for some, tell what they gave, look at all.
 
-    def __init__(self, study: optuna.Study, space: Space) -> None:
+    Several workers may hold one study, each with a log of its own. What a worker leaves behind is
+    found by the others: at once if it was interrupted, by its missing signs of life if it was
+    killed.
+    """
+
+    def __init__(self, study: optuna.Study, space: Space, heart: Heart | None = None) -> None:
         self.study, self.space = study, space
         self.distributions = distributions(space)
-        self._asked: dict[int, optuna.Trial] = {}
+        self._heart = heart
+        self._since = len(self._all())
+        #: Number of each trial that this log asked for -> its id in the storage.
+        self._asked: dict[int, int] = {}
         self._backend: optuna.storages.RDBStorage | None = None
 
     @classmethod
@@ -134,62 +139,117 @@ class TrialLog:
         resume: bool,
         owned: bool,
         objectives: int = 1,
+        grace: int = 60,
     ) -> TrialLog:
-        """Create or resume the study `name` in `storage`.
+        """Create, join or resume the study `name` in `storage`.
 
         Args:
             task: what is searched (scene, number of baffles, objective, simulator), plain values:
                 a study of another task is refused.
-            resume: go on with a study that exists.
+            resume: go on with a study that exists. One that others may work on is always joined.
             owned: nobody else uses the storage, so trials left running are leftovers of a crash.
             objectives: how many costs a trial has.
+            grace: seconds without a sign of life after which another worker counts as dead.
 
         Raises:
             StudyError: if the storage cannot be reached, the study exists and `resume` is not set,
                 or it belongs to another task.
         """
         with storage_errors(storage):
-            backend = _backend(storage)
+            backend = open_storage(storage, None if owned else grace)
             try:
                 study = optuna.create_study(
                     storage=backend,
                     study_name=name,
                     directions=["minimize"] * objectives,
-                    load_if_exists=resume,
+                    load_if_exists=resume or not owned,
                 )
             except optuna.exceptions.DuplicatedStudyError:
                 raise StudyError(
-                    f"{storage} already holds the study {name!r}: go on with --resume, or choose "
-                    "another --out or --storage"
+                    f"{public(storage)} already holds the study {name!r}: go on with --resume, or "
+                    "choose another --out or --storage"
                 ) from None
-            known = study.user_attrs.get("task")
-            if known is None:
+            if "task" not in study.user_attrs:
                 study.set_user_attr("task", json.dumps(task))
-            else:
-                _same_task(json.loads(known), json.loads(json.dumps(task)))
+            # Read back, for two workers may begin a study at the same time.
+            known, own = json.loads(study.user_attrs["task"]), json.loads(json.dumps(task))
+            _same_task(known, own, "--out" if owned else "--study")
+            log = cls(study, space, None if owned else Heart(backend))
+            log._backend = backend
             if owned:
                 for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
-                    study.tell(trial.number, state=TrialState.FAIL)
-        log = cls(study, space)
-        log._backend = backend
+                    log._lose(trial._trial_id, bool(trial.params))
         return log
 
     def close(self) -> None:
         """Leave the storage; an SQLite file is one file again then."""
+        if self._heart is not None:
+            self._heart.stop()
         if self._backend is not None:
             self._backend.engine.dispose()
+
+    # -- asking --------------------------------------------------------------------------------
 
     def ask(self, count: int, sampler: optuna.samplers.BaseSampler, origin: str) -> list[Proposal]:
         """`count` layouts to run: those enqueued first, then the sampler's, all buildable."""
         self.study.sampler = sampler
-        proposals = []
+        proposals: list[Proposal] = []
         for _ in range(count):
-            trial = self.study.ask(self.distributions)
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")  # heartbeats without `Study.optimize`: `Heart`
+                    trial = self.study.ask(self.distributions)
+            except optuna.exceptions.UpdateFinishedTrialError:
+                # This worker counted as dead while it sampled: that trial is gone.
+                for number in set(self._asked) - {p.number for p in proposals}:
+                    self._let_go(number)
+                continue
+            self.hold(trial.number, trial._trial_id)
             centres = self.buildable(to_centres(self.space, trial.params))
-            source = trial.user_attrs.get("origin", origin)
-            self._asked[trial.number] = trial
+            source = trial.user_attrs.get(ledger.ORIGIN, origin)
             proposals.append(Proposal(trial.number, source, centres))
         return proposals
+
+    def reserve(self, layouts: Sequence[tuple[str, np.ndarray]], passes: int = 1) -> list[Proposal]:
+        """Given layouts (origin, centres [m]) as trials under way, each of that many passes."""
+        proposals = []
+        for origin, centres in layouts:
+            centres = self.buildable(centres)
+            attributes = {ledger.ORIGIN: origin, ledger.PASSES: passes}
+            number, trial_id = self._create(TrialState.RUNNING, centres, attributes)
+            self.hold(number, trial_id)
+            proposals.append(Proposal(number, origin, centres))
+        return proposals
+
+    def again(self, count: int) -> list[Proposal]:
+        """At most `count` layouts that other workers, or an earlier run, asked for and left."""
+        self._note_the_lost()
+        proposals: list[Proposal] = []
+        for trial in self.study.get_trials(deepcopy=False, states=(TrialState.WAITING,)):
+            if len(proposals) == count:
+                break
+            if ledger.RETRY_OF not in trial.user_attrs or not self._take(trial._trial_id):
+                continue
+            self.hold(trial.number, trial._trial_id)
+            centres = self.buildable(to_centres(self.space, trial.params))
+            proposals.append(Proposal(trial.number, trial.user_attrs[ledger.ORIGIN], centres))
+        return proposals
+
+    def admit(
+        self, proposals: Sequence[Proposal], budget: int, price: int
+    ) -> list[Proposal | None]:
+        """`proposals`, None in place of those that another worker's make superfluous: beyond the
+        budget [passes], or of a given layout that another runs. `price`: see `ledger.held`.
+        """
+        trials, numbers = self._all(), [p.number for p in proposals]
+        twins = ledger.twins(trials, numbers, self._since)
+        trials = [t for t in trials if t.number not in twins]
+        dropped = twins | ledger.surplus(trials, numbers, budget, price)
+        for number in dropped:
+            trial_id = self._asked[number]
+            self.study._storage.set_trial_user_attr(trial_id, ledger.DROPPED, True)
+            self._let_go(number)
+        return [None if p.number in dropped else p for p in proposals]
 
     def enqueue(self, origin: str, centres: np.ndarray) -> None:
         """Have `ask` return a layout before the sampler's own, unless it was tried already."""
@@ -197,31 +257,51 @@ class TrialLog:
         if any(distance(t.centres, centres) < 1e-6 for t in self.trials()):
             return
         self.study.enqueue_trial(
-            to_parameters(self.space, centres), user_attrs={"origin": origin}, skip_if_exists=True
+            to_parameters(self.space, centres),
+            user_attrs={ledger.ORIGIN: origin},
+            skip_if_exists=True,
         )
+
+    def hold(self, number: int, trial_id: int) -> None:
+        """This log runs that trial: it will tell it or leave it."""
+        if number not in self._asked:
+            self._asked[number] = trial_id
+            if self._heart is not None:
+                self._heart.beat_for(trial_id)
+                self.study._storage.set_trial_user_attr(trial_id, ledger.WORKER, worker())
+
+    # -- telling -------------------------------------------------------------------------------
 
     def tell(self, proposal: Proposal, outcome: Outcome) -> Trial:
-        """Record what a proposal gave. A failure is told with its finite penalty."""
-        trial = self._asked.pop(proposal.number)
-        trial.set_user_attr("record", _record(proposal.origin, proposal.centres, outcome))
-        for name, value in outcome.excess.items():
-            trial.set_constraint(name, value)
-        self.study.tell(trial, self._values(outcome))
+        """Record what a proposal gave. A failure is told with its finite penalty.
+
+        If this worker counted as dead meanwhile, the layout is another's to tell.
+        """
+        trial_id = self._asked[proposal.number]
+        record = _record(proposal.origin, proposal.centres, outcome)
+        with contextlib.suppress(optuna.exceptions.UpdateFinishedTrialError):
+            self.study._storage.set_trial_user_attr(trial_id, ledger.RECORD, record)
+            if outcome.excess:
+                trial = optuna.trial.Trial(self.study, trial_id)
+                for name, value in outcome.excess.items():
+                    trial.set_constraint(name, value)
+            values = self._values(outcome)
+            self.study.tell(proposal.number, values, skip_if_finished=True)
+        del self._asked[proposal.number]
+        if self._heart is not None:
+            self._heart.forget(trial_id)
         return Trial(proposal.number, proposal.origin, proposal.centres, outcome)
 
-    def add(self, origin: str, centres: np.ndarray, outcome: Outcome) -> Trial:
-        """Record a layout that the study did not ask for, so that its sampler learns from it."""
-        centres = self.buildable(centres)
-        self.study.add_trial(
-            optuna.create_trial(
-                params=to_parameters(self.space, centres),
-                distributions=self.distributions,
-                values=self._values(outcome),
-                user_attrs={"record": _record(origin, centres, outcome)},
-                constraints=outcome.excess,
-            )
-        )
-        return Trial(len(self.study.get_trials(deepcopy=False)) - 1, origin, centres, outcome)
+    def add(self, origin: str, centres: np.ndarray, outcome: Outcome) -> Trial | None:
+        """Record a layout that the study did not ask for, so that its sampler learns from it; None
+        if another worker did.
+        """
+        passes = outcome.rollouts + outcome.backwards
+        (proposal,) = self.reserve([(origin, centres)], passes)
+        if ledger.twins(self._all(), [proposal.number]):
+            self._let_go(proposal.number)
+            return None
+        return self.tell(proposal, outcome)
 
     def _values(self, outcome: Outcome) -> list[float]:
         """What the sampler is told: a failure is worse than all that worked by their whole spread.
@@ -239,10 +319,12 @@ class TrialLog:
         return [float(v) for v in 2 * costs.max(axis=0) - costs.min(axis=0)]
 
     def abandon(self) -> None:
-        """Mark what was asked for and will not be told, so that nobody waits for it."""
-        for trial in self._asked.values():
-            self.study.tell(trial, state=TrialState.FAIL)
-        self._asked.clear()
+        """Leave what was asked for and will not be told for others, or a later run, to try."""
+        for number, trial_id in list(self._asked.items()):
+            del self._asked[number]
+            if self._heart is not None:
+                self._heart.forget(trial_id)
+            self._lose(trial_id, bool(self.study._storage.get_trial(trial_id).params))
 
     def buildable(self, centres: np.ndarray) -> np.ndarray:
         """The nearest layout that holds every constraint, numbered across the flow."""
@@ -261,9 +343,88 @@ class TrialLog:
         any did."""
         return min((t for t in self.trials() if t.ok), key=lambda t: t.order, default=None)
 
-    def spent(self) -> int:
+    def spent(self, trials: Sequence[Trial] | None = None) -> int:
         """Passes through a rollout so far: forward and backward ones, each counts one."""
-        return sum(t.outcome.rollouts + t.outcome.backwards for t in self.trials())
+        known = self.trials() if trials is None else trials
+        return sum(t.outcome.rollouts + t.outcome.backwards for t in known)
+
+    def taken(self, price: int) -> int:
+        """Passes that nobody else may spend: spent, being spent, or kept for what is to be tried
+        again. `price`: see `ledger.held`.
+        """
+        return sum(ledger.held(self._all(), price).values())
+
+    def others(self) -> list[int]:
+        """Numbers of the trials that other workers run now."""
+        return [t.number for t in self._running()]
+
+    def at_work(self, origin: str) -> list[np.ndarray]:
+        """Given layouts [m], (n, D-1), of that origin that are being run."""
+        running = [t for t in self._running() if t.user_attrs.get(ledger.ORIGIN) == origin]
+        return [self.buildable(to_centres(self.space, t.params)) for t in running]
+
+    # -- the study -----------------------------------------------------------------------------
+
+    def _all(self) -> list[FrozenTrial]:
+        return self.study.get_trials(deepcopy=False)
+
+    def _running(self) -> list[FrozenTrial]:
+        running = self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
+        return [t for t in running if t.number not in self._asked]
+
+    def _create(
+        self, state: TrialState, centres: np.ndarray, attributes: dict[str, Any]
+    ) -> tuple[int, int]:
+        """A trial of a given layout: its number, and its id in the storage."""
+        trial = optuna.create_trial(
+            state=state,
+            params=to_parameters(self.space, centres),
+            distributions=self.distributions,
+            user_attrs=attributes,
+        )
+        trial_id = self.study._storage.create_new_trial(self.study._study_id, trial)
+        return self.study._storage.get_trial_number_from_id(trial_id), trial_id
+
+    def _take(self, trial_id: int) -> bool:
+        """Whether this log is the one that takes a waiting trial."""
+        try:
+            return self.study._storage.set_trial_state_values(trial_id, TrialState.RUNNING)
+        except optuna.exceptions.UpdateFinishedTrialError:
+            return False
+
+    def _let_go(self, number: int) -> None:
+        """Fail a trial that nobody has to try again."""
+        trial_id = self._asked.pop(number)
+        if self._heart is not None:
+            self._heart.forget(trial_id)
+        self._lose(trial_id, False)
+
+    def _lose(self, trial_id: int, again: bool) -> None:
+        """Fail a trial whose worker is gone; `again`: it has a layout, to be tried again."""
+        with contextlib.suppress(optuna.exceptions.UpdateFinishedTrialError):
+            if again:
+                self.study._storage.set_trial_user_attr(trial_id, ledger.LOST, True)
+            self.study._storage.set_trial_state_values(trial_id, TrialState.FAIL)
+
+    def _note_the_lost(self) -> None:
+        """Enqueue what dead workers left: also what one left that died while noting this."""
+        if self._heart is not None:
+            for trial in self._running():
+                self._heart.adopt(trial._trial_id)
+            for trial_id in self._heart.stale(self.study._study_id):
+                trial = self.study._storage.get_trial(trial_id)
+                if trial.number not in self._asked:
+                    self._lose(trial_id, bool(trial.params))
+        for trial in ledger.lost(self._all()):
+            record = trial.user_attrs.get(ledger.RECORD) or {}
+            origin = trial.user_attrs.get(ledger.ORIGIN) or record.get("origin") or "again"
+            attributes = {
+                ledger.ORIGIN: origin,
+                ledger.RETRY_OF: trial.number,
+                ledger.RETRIES: int(trial.user_attrs.get(ledger.RETRIES, 0)) + 1,
+            }
+            centres = self.buildable(to_centres(self.space, trial.params))
+            self._create(TrialState.WAITING, centres, attributes)
 
 
 def table(trials: Sequence[Trial], space: Space | None = None) -> str:
@@ -311,44 +472,9 @@ def _form_of(space: Space | None, layout: np.ndarray) -> dict[str, float]:
     return {name: known[name] for name in space.names}
 
 
-@contextlib.contextmanager
-def storage_errors(storage: str) -> Iterator[None]:
-    """Turn what a database can throw (unreachable, full disk, foreign file) into a StudyError."""
-    try:
-        yield
-    except (SQLAlchemyError, optuna.exceptions.StorageInternalError, ImportError) as error:
-        cause: BaseException = error
-        while cause.__cause__ is not None:
-            cause = cause.__cause__
-        # The address may carry a password: name the kind and the place only.
-        place = storage.rsplit("@", 1)[-1]
-        raise StudyError(f"study storage {place}: {cause or type(cause).__name__}") from error
-    except (RuntimeError, ValueError) as error:
-        if isinstance(error, GnsError) or "optuna" not in str(error).lower():
-            raise
-        raise StudyError(f"study storage {storage.rsplit('@', 1)[-1]}: {error}") from error
-
-
-def _backend(storage: str) -> optuna.storages.RDBStorage:
-    if not storage.startswith("sqlite"):
-        return optuna.storages.RDBStorage(storage, engine_kwargs={"pool_pre_ping": True})
-    backend = optuna.storages.RDBStorage(storage, engine_kwargs={"connect_args": {"timeout": 60}})
-
-    def tune(connection: Any, _: Any) -> None:
-        # A trial is about ten commits, each a wait for the disk (30 ms on a busy one) unless the
-        # log is written ahead; a power cut may then cost the last trials and never the file.
-        with contextlib.suppress(Exception):  # a file system that cannot do it does without
-            connection.execute("PRAGMA journal_mode=WAL").fetchone()
-            connection.execute("PRAGMA synchronous=NORMAL")
-
-    event.listen(backend.engine, "connect", tune)
-    backend.engine.dispose()  # connect anew
-    return backend
-
-
-def sqlite_url(path: str | os.PathLike[str]) -> str:
-    """The storage address of an SQLite file."""
-    return f"sqlite:///{Path(path).resolve()}"
+def worker() -> str:
+    """The name of this process among the workers of a study."""
+    return f"{socket.gethostname()}-{os.getpid()}"
 
 
 def _record(origin: str, centres: np.ndarray, outcome: Outcome) -> dict[str, Any]:
@@ -364,6 +490,7 @@ def _record(origin: str, centres: np.ndarray, outcome: Outcome) -> dict[str, Any
         "costs": list(outcome.costs),
         "flows": list(outcome.flows),
         "excess": outcome.excess,
+        "worker": worker(),
     }
 
 
@@ -385,10 +512,12 @@ def _trial(frozen: FrozenTrial) -> Trial | None:
     return Trial(frozen.number, str(record["origin"]), np.array(record["centres"]), outcome)
 
 
-def _same_task(known: dict[str, Any], asked: dict[str, Any]) -> None:
+def _same_task(known: dict[str, Any], asked: dict[str, Any], option: str) -> None:
     for key in [*asked, *(key for key in known if key not in asked)]:
         if known.get(key) != asked.get(key):
             values = known.get(key), asked.get(key)
             plain = not any(isinstance(v, (dict, list)) for v in values)
             detail = f" ({values[0]!r}, now {values[1]!r})" if plain else ""
-            raise StudyError(f"the study to resume has another {key}{detail}: choose another --out")
+            raise StudyError(
+                f"the study to resume has another {key}{detail}: choose another {option}"
+            )

@@ -59,10 +59,13 @@ def simulate(
     vtk: Annotated[
         Path | None, typer.Option(help="Also write it for ParaView (VTKHDF, *.vtkhdf).")
     ] = None,
-    threads: Annotated[int, typer.Option(min=1, help="Threads of the solver.")] = CORES,
+    threads: Annotated[int, typer.Option(min=1, help="Threads of the solver on cpu.")] = CORES,
     spacing: Annotated[
         float | None, typer.Option(help="Of the solver's points in m; default: the paper's.")
     ] = None,
+    device: Annotated[
+        str, typer.Option(help="torch device: cpu or cuda; mpm has a solver for each.")
+    ] = "cpu",
     quiet: Quiet = False,
 ) -> None:
     """Run one scene and write its trajectory."""
@@ -74,10 +77,10 @@ def simulate(
         check_name(vtk)
     options: dict[str, Any] = {}
     if simulator == "mpm":
-        options = {"threads": threads, "spacing": spacing}
+        options = {"spacing": spacing, **({"threads": threads} if device == "cpu" else {})}
     elif spacing is not None:
         raise GnsError(f"--spacing is the solver's; {simulator!r} has one of its own")
-    runner = load_simulator(simulator, **options)
+    runner = load_simulator(simulator, device, **options)
     loaded = Scene.from_toml(scene)
     runner.check(loaded)
     with console.progress_bar(quiet=quiet) as bar:

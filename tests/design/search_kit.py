@@ -13,7 +13,8 @@ import torch
 
 from design.campaign import Campaign
 from design.evaluators import InProcess
-from design.trials import TrialLog, sqlite_url
+from design.storage import sqlite_url
+from design.trials import TrialLog
 from gns_env.objective import Objective
 from gns_env.task import BaffleTask
 from gns_model.particles import MOVING, fill

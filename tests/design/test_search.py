@@ -185,11 +185,14 @@ def test_an_interrupt_keeps_what_was_told_and_leaves_nothing_waiting(tmp_path):
     assert resumed.log.spent() == 32
 
 
-def test_trials_left_running_by_a_crash_are_let_go(tmp_path):
+def test_trials_left_running_by_a_crash_are_tried_again(tmp_path):
     c = campaign(tmp_path)
-    c.log.ask(3, bayes.sampler(c, "gp"), "gp")  # and never told
+    asked = c.log.ask(3, bayes.sampler(c, "gp"), "gp")  # and never told
     resumed = campaign(tmp_path, resume=True)
     assert {t.state.name for t in resumed.log.study.get_trials()} == {"FAIL"}
+    resumed.catch_up()
+    again = [t.centres for t in resumed.log.trials()]
+    np.testing.assert_allclose(again, [p.centres for p in asked], atol=1e-9)
 
 
 @pytest.mark.parametrize("search", [gradient.search, hybrid.search])

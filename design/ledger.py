@@ -1,0 +1,119 @@
+"""Who holds what of a budget that several workers share, read off the trials of their study.
+
+Nobody keeps an account: a trial's number says when it was asked for, so every worker that looks at
+the same trials comes to the same answer, and no lock has to outlive a worker that is killed.
+
+    waiting   to be run: an engineering row, or a layout to be tried again
+    running   asked for by a worker, which gives signs of life
+    complete  told, with what it cost
+    failed    left behind by a worker that died or was interrupted ("lost"), or dropped
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from optuna.trial import FrozenTrial, TrialState
+
+#: User attributes of a trial. ORIGIN: where a layout that was given came from; PASSES: what running
+#: it costs; WORKER: who runs it; LOST: its worker left before it was told; RETRY_OF: number of the
+#: lost trial of this layout; RETRIES: how often it was tried again; DROPPED: asked for by two, or
+#: beyond the budget; RECORD: what it gave.
+ORIGIN, PASSES, WORKER, LOST, RETRY_OF, RETRIES, DROPPED, RECORD = (
+    "origin", "passes", "worker", "lost", "retry_of", "retries", "dropped", "record",
+)  # fmt: skip
+#: A layout that took its worker down so often is given up.
+MOST_RETRIES = 5
+
+
+def held(trials: Sequence[FrozenTrial], price: int) -> dict[int, int]:
+    """What each trial, by number, holds of the budget [passes]: spent, being spent, or kept for a
+    lost layout until it is tried again.
+
+    Args:
+        price: of a trial that does not say: one rollout of a layout.
+    """
+    tried_again = {t.number for t in lost(trials)}
+    found, seen = {}, set()
+    for t in sorted(trials, key=lambda t: t.number):
+        attributes = t.user_attrs
+        if RETRY_OF in attributes and not t.state.is_finished():
+            # Two workers that note the same loss: one of their notes counts.
+            if attributes[RETRY_OF] in seen:
+                continue
+            seen.add(attributes[RETRY_OF])
+        if t.state == TrialState.COMPLETE:
+            record = attributes.get(RECORD)
+            if record is not None:
+                found[t.number] = int(record["rollouts"]) + int(record["backwards"])
+        elif t.state == TrialState.RUNNING:
+            found[t.number] = int(attributes.get(PASSES, price))
+        elif (t.state == TrialState.WAITING and RETRY_OF in attributes) or t.number in tried_again:
+            found[t.number] = price
+    return found
+
+
+def lost(trials: Sequence[FrozenTrial]) -> list[FrozenTrial]:
+    """Failed trials whose layout is to be tried again, and waits for it in no trial yet."""
+    again = {t.user_attrs.get(RETRY_OF) for t in trials}
+    return [
+        t
+        for t in trials
+        if t.state == TrialState.FAIL
+        and t.user_attrs.get(LOST)
+        and t.number not in again
+        and int(t.user_attrs.get(RETRIES, 0)) < MOST_RETRIES
+    ]
+
+
+def surplus(
+    trials: Sequence[FrozenTrial], numbers: Sequence[int], budget: int, price: int
+) -> set[int]:
+    """Which of `numbers` have no room in the budget beside the trials that were asked before."""
+    holds = held(trials, price)
+    taken, beyond = 0, set()
+    for number in sorted(holds):
+        if number in numbers and taken + holds[number] > budget:
+            beyond.add(number)
+        else:
+            taken += holds[number]
+    return beyond
+
+
+def twins(trials: Sequence[FrozenTrial], numbers: Sequence[int], since: int = 0) -> set[int]:
+    """Which of `numbers` are of a layout that an earlier trial holds, given and not sampled.
+
+    The row that two workers both wanted to have tried, the layout from which both want to leap, the
+    lost layout that both noted. A sampler may propose what it likes.
+
+    Args:
+        since: a chain of gradients may begin again where one was before that trial: a search that
+            is resumed does.
+    """
+    found = set()
+    given = [t for t in trials if ORIGIN in t.user_attrs and DROPPED not in t.user_attrs]
+    for t in given:
+        if t.number in numbers and any(_same(t, o, since) for o in given if o.number < t.number):
+            found.add(t.number)
+    return found
+
+
+def _same(later: FrozenTrial, earlier: FrozenTrial, since: int) -> bool:
+    ours, theirs = later.user_attrs, earlier.user_attrs
+    if RETRY_OF in ours and ours[RETRY_OF] == theirs.get(RETRY_OF):
+        return True
+    if earlier.state == TrialState.FAIL or ours[ORIGIN] != theirs[ORIGIN]:
+        return False
+    old = earlier.state == TrialState.COMPLETE and earlier.number < since
+    return not (ours[ORIGIN] == "gradient" and old) and _same_place(later, earlier)
+
+
+def _same_place(one: FrozenTrial, other: FrozenTrial) -> bool:
+    a, b = (t.system_attrs.get("fixed_params") or t.params for t in (one, other))
+    return bool(a) and a.keys() == b.keys() and all(_near(a[k], b[k]) for k in a)
+
+
+def _near(one: object, other: object) -> bool:
+    if isinstance(one, float) and isinstance(other, float):
+        return abs(one - other) < 1e-6
+    return one == other

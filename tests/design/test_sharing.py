@@ -1,0 +1,371 @@
+"""Several workers on one study: a budget for all, and nothing lost when one is killed."""
+
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import optuna
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from design import ledger
+from design.campaign import Campaign
+from design.cli import app
+from design.evaluators import InProcess
+from design.folder import claim, release
+from design.methods import METHODS
+from design.storage import StudyError, public, sqlite_url
+from design.trials import Outcome, TrialLog
+from gns_env.layout import LayoutSpace
+from gns_env.objective import Objective
+from gns_env.task import BaffleTask
+from gns_model import console
+from gns_model.scene import Scene
+
+from . import postgres
+from .search_kit import FormulaSimulator, formula_scene
+
+#: Seconds without a sign of life; more than a busy machine may hold a process up.
+GRACE = 8
+
+
+@pytest.fixture(scope="module")
+def server():
+    """Port of a PostgreSQL server."""
+    if postgres.programs() is None:
+        pytest.skip("no PostgreSQL here: apt-get install postgresql, pip install psycopg[binary]")
+    with postgres.server() as port:
+        yield port
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def storage(request, tmp_path):
+    """Address of an empty database of either kind."""
+    if request.param == "sqlite":
+        return sqlite_url(tmp_path / "shared.db")
+    return new_database(request.getfixturevalue("server"))
+
+
+def new_database(port):
+    import psycopg
+
+    address = f"gns:{postgres.PASSWORD}@127.0.0.1:{port}"
+    name = f"d{time.time_ns()}"
+    with psycopg.connect(f"postgresql://{address}/postgres", autocommit=True) as connection:
+        connection.execute(f"CREATE DATABASE {name}")
+    return f"postgresql://{address}/{name}"
+
+
+class SlowFormula(FormulaSimulator):
+    """A rollout takes a while, so that there is a middle of it."""
+
+    def rollout(self, scenes, *, progress=None):
+        time.sleep(0.1 * sum(bool(scene.baffles) for scene in scenes))
+        return super().rollout(scenes)
+
+
+def worker(storage, method, budget, salt, until):
+    """One worker: a search on the shared study, to its end."""
+    task = BaffleTask(
+        formula_scene(), SlowFormula(), n_baffles=2, objective=Objective(depth_weight=0.0)
+    )
+    log = TrialLog.open(
+        storage, "test", task.space, {"n": 2}, resume=False, owned=False, grace=GRACE
+    )
+    until.wait(30)
+    campaign = Campaign(log, InProcess(task), budget, batch=4, salt=salt)
+    METHODS[method](campaign)
+    while campaign.wait():
+        METHODS[method](campaign)
+    log.close()
+
+
+def kill_within_a_trial(storage, name, pid, after=0):
+    """End a worker that runs trials, once so many are told; the study, and their numbers."""
+    address = storage.replace("postgresql:", "postgresql+psycopg:")
+    study, end = None, time.monotonic() + 120
+    while time.monotonic() < end:
+        time.sleep(0.05)
+        try:
+            study = study or optuna.load_study(study_name=name, storage=address)
+        except Exception:  # it is being made
+            continue
+        trials = study.get_trials(deepcopy=False)
+        if sum(t.state.name == "COMPLETE" for t in trials) < after or not runs(trials, pid):
+            continue
+        os.kill(pid, signal.SIGSTOP)  # so that it is in the middle when it is looked at
+        time.sleep(0.2)
+        try:
+            asked = runs(study.get_trials(deepcopy=False), pid)
+        except optuna.exceptions.StorageInternalError:  # it was stopped while it wrote
+            asked = set()
+        os.kill(pid, signal.SIGKILL if asked else signal.SIGCONT)
+        if asked:
+            return study, asked
+    raise AssertionError("it ran no trial")
+
+
+def runs(trials, pid):
+    """Numbers of the trials that a process runs, of those that it was admitted to."""
+    mine = [t for t in trials if t.state.name == "RUNNING" and ledger.DROPPED not in t.user_attrs]
+    return {t.number for t in mine if t.user_attrs.get(ledger.WORKER, "").endswith(f"-{pid}")}
+
+
+# One asks the study for layouts, the other gives it layouts and takes their gradients.
+@pytest.mark.parametrize("method", ["tpe", "gradient"])
+def test_workers_share_a_budget_and_one_is_killed(storage, method):
+    """Three at once; one gets SIGKILL while its batch runs. Every layout it had asked for is run
+    by the others, the budget is spent to the last pass and no further, no row is tried twice."""
+    budget = 40
+    context = multiprocessing.get_context("forkserver")  # pays for the imports once
+    context.set_forkserver_preload([__name__, "optuna", "design.methods", "cvxpy", "psycopg"])
+    start = context.Barrier(3)
+    workers = [
+        context.Process(target=worker, args=(storage, method, budget, salt, start))
+        for salt in (1, 2, 3)
+    ]
+    for process in workers:
+        process.start()
+    study, asked = kill_within_a_trial(storage, "test", workers[0].pid, after=6)
+    for process in workers[1:]:
+        process.join(90)
+    assert [p.exitcode for p in workers] == [-signal.SIGKILL, 0, 0]
+
+    trials = study.get_trials()
+    states = Counter(t.state.name for t in trials)
+    assert states["RUNNING"] == 0
+    told = [t for t in trials if t.state.name == "COMPLETE"]
+    records = [t.user_attrs[ledger.RECORD] for t in told]
+    spent = sum(r["rollouts"] + r["backwards"] for r in records)
+    assert budget - 1 <= spent <= budget  # a gradient takes two
+    # The killed worker's trials: failed, and complete as another trial of the same layout.
+    lost = [t for t in trials if t.user_attrs.get(ledger.LOST)]
+    assert asked
+    assert asked <= {t.number for t in lost}
+    for t in lost:
+        (again,) = [a for a in told if a.user_attrs.get(ledger.RETRY_OF) == t.number]
+        assert again.params == pytest.approx(t.params)
+        assert not again.user_attrs[ledger.RECORD]["worker"].endswith(f"-{workers[0].pid}")
+    assert len({r["worker"] for r in records}) >= 2
+    given = [
+        (t.user_attrs[ledger.ORIGIN], tuple(np.round(sorted(t.params.values()), 5)))
+        for t in told
+        if ledger.ORIGIN in t.user_attrs
+    ]
+    assert len(given) == len(set(given))
+
+
+# -- the ledger ------------------------------------------------------------------------------------
+
+
+@settings(max_examples=25)
+@given(
+    steps=st.lists(
+        st.tuples(st.integers(0, 2), st.sampled_from(["ask", "rows", "steps", "tell", "die"])),
+        max_size=14,
+    ),
+    budget=st.integers(4, 20),
+)
+def test_whoever_asks_tells_or_dies_when_the_budget_is_spent_and_no_more(steps, budget):
+    """Whatever three workers do in whatever order, those that are left spend exactly the rest."""
+    study = optuna.create_study()
+    space = LayoutSpace(formula_scene(), 1)
+    rows = [("row", np.array([[0.7, z]])) for z in (0.4, 0.8, 1.2)]
+    sampler = optuna.samplers.RandomSampler(seed=0)
+    logs = [TrialLog(study, space) for _ in range(3)]
+    open_ = [[] for _ in logs]
+    forward, both = Outcome(1.0, {}), Outcome(1.0, {}, backwards=1)
+
+    def admitted(log, proposals):
+        return [p for p in log.admit(proposals, budget, 1) if p is not None]
+
+    for k, what in steps:
+        log = logs[k]
+        if what == "ask":
+            open_[k] += [(p, forward) for p in admitted(log, log.again(2))]
+            open_[k] += [(p, forward) for p in admitted(log, log.ask(2, sampler, "random"))]
+        elif what == "rows":
+            open_[k] += [(p, forward) for p in admitted(log, log.reserve(rows))]
+        elif what == "steps":
+            steps_ = log.reserve([("gradient", np.array([[0.9, 0.3 + 0.2 * k]]))], 2)
+            open_[k] += [(p, both) for p in admitted(log, steps_)]
+        elif what == "tell":
+            for proposal, outcome in open_[k]:
+                log.tell(proposal, outcome)
+            open_[k] = []
+        else:
+            log.abandon()
+            open_[k] = []
+        assert log.taken(1) <= budget
+    for log in logs[1:]:
+        log.abandon()
+    rest = logs[0]
+    rest.abandon()
+    while proposals := rest.again(3) or rest.ask(min(3, budget - rest.taken(1)), sampler, "random"):
+        for proposal in admitted(rest, proposals):
+            rest.tell(proposal, forward)
+    assert rest.spent() == rest.taken(1) == budget
+    frozen = study.get_trials()
+    lost = {t.number for t in frozen if ledger.LOST in t.user_attrs}
+    told = [t for t in rest.trials()]
+    assert not ledger.lost(frozen)
+    assert lost <= {t.user_attrs.get(ledger.RETRY_OF) for t in frozen}
+    places = [tuple(t.centres.ravel()) for t in told if t.origin == "row"]
+    assert len(places) == len(set(places))
+
+
+def test_a_layout_that_kills_its_worker_is_given_up(tmp_path):
+    space = LayoutSpace(formula_scene(), 1)
+    log = TrialLog(optuna.create_study(), space)
+    (proposal,) = log.reserve([("row", np.array([[0.7, 0.4]]))])
+    for _ in range(ledger.MOST_RETRIES):
+        log.abandon()
+        (proposal,) = log.again(8)
+        assert proposal.origin == "row"
+    log.abandon()
+    assert log.again(8) == []
+    assert log.taken(1) == 0
+
+
+def test_a_worker_that_was_thought_dead_does_not_tell_twice(tmp_path):
+    space = LayoutSpace(formula_scene(), 1)
+    study = optuna.create_study()
+    sleeper, other = TrialLog(study, space), TrialLog(study, space)
+    (mine,) = sleeper.reserve([("row", np.array([[0.7, 0.4]]))])
+    other._lose(sleeper._asked[mine.number], True)
+    (theirs,) = other.again(1)
+    other.tell(theirs, Outcome(1.0, {}))
+    sleeper.tell(mine, Outcome(1.0, {}))
+    assert [t.number for t in other.trials()] == [theirs.number]
+
+
+# -- the command -----------------------------------------------------------------------------------
+
+#: The command without its pictures, which take most of the time of so short a run.
+COMMAND = """
+import design.report
+design.report.write_report = lambda folder: None
+from design.cli import main
+main()
+"""
+
+
+@pytest.fixture
+def scene_file(tmp_path):
+    """A plane flow of which the solver makes a rollout in half a second."""
+    scene = Scene.from_dict(
+        {
+            "name": "plane",
+            "duration": 0.4,
+            "section": 0.6,
+            "domain": {"lower": [0.0, 0.0], "upper": [1.2, 0.4]},
+            "release": [{"lower": [0.0, 0.0], "upper": [0.2, 0.2], "velocity": [1.0, 0.0]}],
+            "baffle": [{"center": [0.5], "size": [0.05, 0.1]}],
+            "placement": {"lower": [0.3], "upper": [1.0], "gap": 0.05},
+        }
+    )
+    scene.to_toml(tmp_path / "plane.toml")
+    return tmp_path / "plane.toml"
+
+
+def options(storage, out, *more):
+    return [
+        "--simulator", "mpm", "--spacing", "0.01", "--verify", "0", "--workers", "1",
+        "--grace", str(GRACE), "--storage", storage, "--out", str(out), *map(str, more),
+    ]  # fmt: skip
+
+
+def refused(capsys, *arguments):
+    """The one line with which the command refuses `arguments`."""
+    with pytest.raises(SystemExit) as left:
+        console.main(app, "gns-design", ["optimize", *map(str, arguments), "--quiet"])
+    captured = capsys.readouterr()
+    assert left.value.code == 2
+    assert captured.err.startswith("error: ")
+    assert captured.err.count("\n") == 1, captured.err
+    return captured.err
+
+
+@pytest.mark.slow
+def test_the_command_on_two_machines_of_which_one_dies(server, scene_file, tmp_path, capsys):
+    """`gns-design optimize --storage postgresql://…` twice; one is killed within a rollout."""
+    storage = new_database(server)
+    more = ["--budget", "14", "--batch", "4", "--method", "random"]
+    first, second = (
+        subprocess.Popen(
+            [sys.executable, "-c", COMMAND, "optimize", scene_file]
+            + options(storage, tmp_path / name, *more),
+            cwd=Path(__file__).parents[2], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )
+        for name in ("first", "second")
+    )  # fmt: skip
+    study, asked = kill_within_a_trial(storage, "gns-design", first.pid)
+    first.communicate()
+    out, err = second.communicate(timeout=120)
+    assert second.returncode == 0, err
+    assert postgres.PASSWORD.encode() not in out + err
+    summary = json.loads((tmp_path / "second" / "summary.json").read_text())
+    assert summary["status"] == "complete"
+    assert summary["rollouts"] == 14
+    assert postgres.PASSWORD not in json.dumps(summary)
+    assert not (tmp_path / "first" / "summary.json").exists()
+    trials = study.get_trials()
+    assert not [t for t in trials if t.state.name in ("RUNNING", "WAITING")]
+    lost = {t.number for t in trials if t.user_attrs.get(ledger.LOST)}
+    again = [t for t in trials if ledger.RETRY_OF in t.user_attrs]
+    assert {t.user_attrs[ledger.RETRY_OF] for t in again if t.state.name == "COMPLETE"} == lost
+    assert asked <= lost
+
+    # What is another's, or of another problem, is refused; nothing is touched.
+    held = claim(tmp_path / "second")
+    line = refused(capsys, scene_file, *options(storage, tmp_path / "second", "--resume"))
+    assert "--out of its own" in line
+    release(held)
+    before = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*")}
+    line = refused(capsys, scene_file, *options(storage, tmp_path / "third", "--baffles", "2"))
+    assert "another number of baffles (1, now 2)" in line
+    assert "--study" in line
+    wrong = storage.replace(postgres.PASSWORD, "sesame-open")
+    line = refused(capsys, scene_file, *options(wrong, tmp_path / "third"))
+    assert "password authentication failed" in line
+    assert "sesame" not in line
+    port = storage.rsplit(":", 1)[1].split("/")[0]
+    line = refused(capsys, scene_file, *options(storage.replace(port, "1"), tmp_path / "third"))
+    assert "127.0.0.1:1" in line
+    assert postgres.PASSWORD not in line
+    assert {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*")} == before
+
+
+def test_a_folder_of_another_scene_is_refused(scene_file, tmp_path, capsys):
+    out = tmp_path / "run"
+    out.mkdir()
+    other = Scene.from_toml(scene_file)
+    other.replace(duration=0.3).to_toml(out / "scene.toml")
+    (out / "summary.json").write_text("{}")
+    before = {p: p.read_bytes() for p in out.iterdir()}
+    url = sqlite_url(tmp_path / "s.db")
+    line = refused(capsys, scene_file, *options(url, out, "--resume"))
+    assert "another scene" in line
+    assert {p: p.read_bytes() for p in out.iterdir()} == before
+
+
+def test_addresses_are_shown_without_what_is_secret():
+    for address in ("postgresql://u:secret@h:5/d?password=secret", "mysql://secret:secret@h:5/d"):
+        assert "secret" not in public(address)
+        assert "h:5/d" in public(address)
+    assert "secret" not in public("nonsense:secret@h:x/d")
+
+
+def test_a_missing_driver_is_one_clear_line(monkeypatch):
+    monkeypatch.setitem(sys.modules, "psycopg", None)
+    space = LayoutSpace(formula_scene(), 1)
+    with pytest.raises(StudyError, match=r"gns-baffles\[postgres\]"):
+        TrialLog.open("postgresql://u:secret@h/d", "x", space, {}, resume=False, owned=False)
