@@ -393,7 +393,10 @@ def gradient_check(
     positions = simulator.rollout_tensor(
         [scene], [centres], frames=frames, limit=limit, smoothing=smoothing
     )[0]
-    value = smooth_measures(positions, scene, centres, sizes, temperature=temperature)[measure]
+    form: dict[str, Any] = {"sizes": sizes, "temperature": temperature}
+    if scene.is_turned:
+        form["yaws"] = torch.tensor([b.yaw for b in scene.baffles], dtype=dtype, device=device)
+    value = smooth_measures(positions, scene, centres, **form)[measure]
     (gradient,) = torch.autograd.grad(value, centres)
 
     shifted = []
@@ -409,8 +412,7 @@ def gradient_check(
         for moved, there in zip(shifted, scenes, strict=True):
             at = torch.tensor(moved, dtype=dtype, device=device)
             positions = simulator.rollout_tensor([there], [at], frames=frames)[0]
-            smooth = smooth_measures(positions, there, at, sizes, temperature=temperature)
-            values.append(float(smooth[measure]))
+            values.append(float(smooth_measures(positions, there, at, **form)[measure]))
     ahead, behind = np.array(values).reshape(-1, 2).T
     return GradientCheck(
         measure=measure,
@@ -423,13 +425,13 @@ def gradient_check(
 
 
 def moved_baffles(scene: Scene, centres: np.ndarray) -> Scene:
-    """The scene with its own baffles, each with its size, at `centres` [m], shape (B, D-1).
+    """The scene with its own baffles, each with size and yaw, at `centres` [m], shape (B, D-1).
 
     Raises:
         SceneError: if one of them leaves the domain or overlaps something.
     """
     baffles = tuple(
-        {"center": tuple(map(float, c)), "size": b.size}
+        {"center": tuple(map(float, c)), "size": b.size, "yaw": b.yaw}
         for c, b in zip(centres, scene.baffles, strict=True)
     )
     return scene.replace(baffles=baffles)
