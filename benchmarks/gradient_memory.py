@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 FLUME = Path(__file__).parents[1] / "examples" / "flume.toml"
 SHORT = (3, 5)  # frames of the rollouts that keep everything
@@ -27,7 +28,8 @@ def measure(model: str, frames: int | None, checkpoint: bool) -> None:
     from gns_model.scene import Scene
 
     torch.set_num_threads(1)
-    scene, simulator = Scene.from_toml(FLUME), load_simulator(model)
+    scene = Scene.from_toml(FLUME)
+    simulator: Any = load_simulator(model)
     for parameter in simulator.model.parameters():
         parameter.requires_grad_(False)  # as a search has it
     before = _peak()

@@ -90,6 +90,14 @@ def default_method(simulator: Simulator, parameter: Parameter, method: Method | 
             f"{simulator.name} does not see the friction angle, so it cannot find it: give "
             f"{models_that_see_friction()}"
         )
+    if learned and parameter == "velocity" and simulator.config.solver_steps:  # type: ignore[attr-defined]
+        # The solver's first steps stand between the release and the network.
+        if method == "gradient":
+            raise SimulatorError(
+                f"{simulator.name} leaves its first steps to the reference solver, so it has no "
+                "gradient by the velocity of the release: give --method differences"
+            )
+        return "differences"
     return method or ("gradient" if learned else "differences")
 
 

@@ -163,6 +163,11 @@ def test_simulators_that_cannot(scene):
         default_method(blind, "friction", None)
     with pytest.raises(SimulatorError, match="no gradient"):
         default_method(MpmSimulator(spacing=0.05), "velocity", "gradient")
+    config = config.model_copy(update={"solver_steps": 5})
+    begun = LearnedSimulator(LearnedModel(config), "begun")
+    assert default_method(begun, "velocity", None) == "differences"
+    with pytest.raises(SimulatorError, match="first steps"):
+        default_method(begun, "velocity", "gradient")
     release = scene.releases[0]
     above = release.model_copy(
         update={"lower": (0.0, 0.25, 0.1), "upper": (0.2, 0.4, 0.5), "velocity": (1.0, -1.0, 0.0)}

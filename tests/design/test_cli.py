@@ -150,8 +150,9 @@ def test_bad_options(capsys, scene_file, tmp_path, arguments, words):
 
 def test_devices(capsys, scene_file):
     for device in ("toaster", "cuda:99"):
-        line = refused(capsys, "evaluate", scene_file, "--simulator", "x", "--device", device)
-        assert device in line
+        for simulator in ("x", "mpm"):
+            asked = ["--simulator", simulator, "--device", device]
+            assert device in refused(capsys, "evaluate", scene_file, *asked)
 
 
 def test_an_out_that_cannot_be_written(capsys, scene_file, tmp_path):
