@@ -21,7 +21,7 @@ from gns_model.learned.graph import radius_graph
 #: Limit of a grain's adjoint for design gradients over a whole flow, in medians of its scene.
 ADJOINT_LIMIT = 6.0
 #: Share of its adjoint that a grain gives to and takes from its neighbours in each step.
-ADJOINT_SMOOTHING = 1.0
+ADJOINT_SMOOTHING = 0.2
 
 
 class FilterAdjoint(torch.autograd.Function):
