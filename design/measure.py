@@ -72,6 +72,8 @@ def measure(
         "scene": scene.name,
         "baffles": len(scene.baffles),
         "layout": json.loads(json.dumps([b.center for b in scene.baffles])),
+        "size": [list(b.size) for b in scene.baffles],
+        "yaw": [b.yaw for b in scene.baffles],
         "simulator": spec.name,
         "measures": own,
         "no_baffles": none,

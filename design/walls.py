@@ -176,8 +176,12 @@ def _baffle(name: str, body: trimesh.Trimesh, scene: Scene) -> Baffle:
         )
         top = min(float(upper[1]), float(high[1]))
         return Baffle(
-            center=tuple(map(float, middle)),
-            size=(float(sides[0]), round(top - scene.base, 7), float(sides[1])),
+            center=(round(float(middle[0]), 7), round(float(middle[1]), 7)),
+            size=(
+                round(float(sides[0]), 7),
+                round(top - scene.base, 7),
+                round(float(sides[1]), 7),
+            ),
             yaw=yaw,
         )
     lower, upper = np.maximum(lower, low), np.minimum(upper, high)

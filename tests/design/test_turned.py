@@ -42,6 +42,7 @@ def test_what_we_write_of_turned_baffles_we_read(turned, tmp_path, kind):
     assert {b.size[1] for b in back.baffles} == {0.3}
     # 90 comes back as exchanged sides, the others as they were.
     assert {b.yaw for b in back.baffles} == {20.0, 45.0, 0.0}
+    assert back.baffles[0] == turned.baffles[0]
     mesh = baffle_mesh(turned)
     assert mesh.is_watertight
     assert mesh.volume == pytest.approx(3 * 0.1 * 0.3 * 0.25)
