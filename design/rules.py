@@ -102,6 +102,14 @@ class Rules:
             )
         return found
 
+    def __str__(self) -> str:
+        parts = []
+        if self.baffle_cost:
+            parts.append(f"{self.baffle_cost:g} a baffle")
+        if self.concrete_cost:
+            parts.append(f"{self.concrete_cost:g} a m³ of concrete")
+        return " and ".join(parts)
+
     def failed(self) -> dict[str, float]:
         """The excess of a rollout that failed: whatever was asked, it did not show it."""
         return dict.fromkeys(self.limited, FAILED)

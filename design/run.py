@@ -347,7 +347,7 @@ class Run:
                 "workers": self.workers,
                 "simulator": {**s.simulator.describe(), "device": s.simulator.device},
                 "verify_with": s.verifier.describe(),
-                "objective": {**asdict(s.objective), "text": str(s.objective)},
+                "objective": {**asdict(s.objective), "text": self._objective_text()},
                 **({"objectives": ",".join(s.objectives)} if s.objectives else {}),
                 **_freed(s),
                 **({"scenarios": _described(s.scenarios)} if s.scenarios else {}),
@@ -551,6 +551,10 @@ class Run:
     def built(self, flow: Scene, layout: Judged) -> Scene:
         """`flow` with the baffles of a layout that the search proposed."""
         return built(flow, self.space, layout.centres)
+
+    def _objective_text(self) -> str:
+        text = str(self.settings.objective)
+        return f"{text}; plus {self.rules}" if self.rules.charges else text
 
     def _kept(self, ranked: Sequence[Judged], trials: Sequence[Trial]) -> dict[str, Any]:
         """What summary.json says of the constraints of the best, and of those that none keeps."""

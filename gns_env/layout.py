@@ -297,7 +297,7 @@ def _area(scene: Scene, placement: Placement) -> Array:
     area = np.array(
         [np.maximum(placement.lower, lower), np.minimum(placement.upper, upper)], dtype=float
     )
-    if placement.wall_gap and (area[0] > area[1] + TOLERANCE).any():
+    if placement.wall_gap and (area[0] > area[1] - TOLERANCE).any():
         raise LayoutError(
             f"wall_gap {placement.wall_gap:g} m leaves nothing of the placement area of "
             f"{_metres(np.array(placement.upper) - placement.lower)}"
