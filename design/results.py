@@ -254,6 +254,8 @@ class RunResults:
                     setattr(design, attribute, _numbers(measures.summary(trajectory)))
                     if design.centres is None:
                         design.centres = _centres([b.center for b in trajectory.scene.baffles])
+                        for first in trajectory.scene.baffles[:1]:
+                            design.size, design.yaw = first.size, first.yaw
         return design
 
 
