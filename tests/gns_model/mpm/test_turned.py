@@ -167,3 +167,10 @@ def test_a_quarter_turn_is_exchanged_sides_to_the_last_bit(block):
     plain = block.with_baffles([(0.5, 0.3)], size=(0.3, 0.3, 0.06), yaw=0.0)
     a, b = simulator.rollout([turned.replace(duration=0.1), plain.replace(duration=0.1)])
     np.testing.assert_array_equal(a.positions, b.positions)
+
+
+def test_threads_agree_to_the_last_bit(block):
+    short = block.replace(duration=0.15)
+    one, two = (MpmSimulator(spacing=0.05, threads=n).rollout([short])[0] for n in (1, 2))
+    assert np.abs(one.positions[-1] - one.positions[0]).max() > 0.1
+    np.testing.assert_array_equal(one.positions, two.positions)
