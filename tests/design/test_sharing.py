@@ -80,7 +80,7 @@ def worker(storage, method, budget, salt, until):
     log = TrialLog.open(
         storage, "test", task.space, {"n": 2}, resume=False, owned=False, grace=GRACE
     )
-    until.wait(30)
+    until.wait(300)
     campaign = Campaign(log, InProcess(task), budget, batch=4, salt=salt)
     METHODS[method](campaign)
     while campaign.wait():
@@ -91,7 +91,7 @@ def worker(storage, method, budget, salt, until):
 def kill_within_a_trial(storage, name, pid, after=0):
     """End a worker that runs trials, once so many are told; the study, and their numbers."""
     address = storage.replace("postgresql:", "postgresql+psycopg:")
-    study, end = None, time.monotonic() + 120
+    study, end = None, time.monotonic() + 300
     while time.monotonic() < end:
         time.sleep(0.05)
         try:
@@ -136,7 +136,7 @@ def test_workers_share_a_budget_and_one_is_killed(storage, method):
         process.start()
     study, asked = kill_within_a_trial(storage, "test", workers[0].pid, after=6)
     for process in workers[1:]:
-        process.join(90)
+        process.join(300)
     assert [p.exitcode for p in workers] == [-signal.SIGKILL, 0, 0]
 
     trials = study.get_trials()
@@ -309,7 +309,7 @@ def test_the_command_on_two_machines_of_which_one_dies(server, scene_file, tmp_p
     )  # fmt: skip
     study, asked = kill_within_a_trial(storage, "gns-design", first.pid)
     first.communicate()
-    out, err = second.communicate(timeout=120)
+    out, err = second.communicate(timeout=300)
     assert second.returncode == 0, err
     assert postgres.PASSWORD.encode() not in out + err
     summary = json.loads((tmp_path / "second" / "summary.json").read_text())
