@@ -33,6 +33,7 @@ def constraints(scene: Scene, rules: Rules, judged: Judged) -> list[dict[str, An
     found: list[dict[str, Any]] = []
 
     def add(name: str, title: str, limit: float, value: float, unit: str, least: bool) -> None:
+        value = round(value, 9) + 0.0  # no -0 and no round-off
         margin = value - limit if least else limit - value
         found.append(
             {
