@@ -22,7 +22,7 @@ from design.rules import broken
 from design.store import Pending, Rolled, Watch
 from design.trials import Outcome
 from design.verify import Judged
-from design.wording import quantities
+from design.wording import count, quantities
 from gns_model.errors import SimulatorError
 from gns_model.scene import Scene
 
@@ -183,8 +183,8 @@ class Panel:
         self._bare = {spec: roll(spec, None) for spec in ensemble.members}
         watch.add("ensemble: no baffles", [p for ps in self._bare.values() for p in ps])
 
-    def choose(self, layouts: Sequence[Judged], count: int) -> list[Judged]:
-        """The `count` of `layouts` that all members together think best, all of them judged.
+    def choose(self, layouts: Sequence[Judged], number: int) -> list[Judged]:
+        """The `number` of `layouts` that all members together think best, all of them judged.
 
         The best by the searcher's own cost stays among them: it is what the search was for.
         """
@@ -198,14 +198,14 @@ class Panel:
                 j.ensemble_cost if j.ensemble_cost is not None else math.inf,
             )
         )
-        return [first, *others[: count - 1]]
+        return [first, *others[: number - 1]]
 
     def judge(self, layouts: Sequence[Judged]) -> None:
         """Fill in the spread, the marks and the mean cost of `layouts`."""
         others = [s for s in self.ensemble.members if s != self._searcher]
         started = {(k, s): self._roll(s, x) for k, x in enumerate(layouts) for s in others}
         waiting = [p for ps in (*started.values(), *self._bare.values()) for p in ps]
-        self._watch.add(f"ensemble: {len(layouts)} layouts", [*waiting])
+        self._watch.add(f"ensemble: {count(len(layouts), 'layout').lower()}", [*waiting])
         self._watch.wait(waiting)
         bare = {s: [p.result() for p in ps] for s, ps in self._bare.items()}
         none = {s: self._weigh(rolled, rolled) for s, rolled in bare.items()}

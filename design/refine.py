@@ -27,6 +27,7 @@ from design.lessons import Lesson, teach, training_files
 from design.store import RolloutStore, Watch
 from design.summary import COMPLETE, PARTIAL
 from design.verify import Judged, gap, rank
+from design.wording import count
 from gns_model.data.windows import read_source
 from gns_model.errors import SimulatorError
 
@@ -175,7 +176,7 @@ def _seen_by(
     pending = [run.roll(store, spec, j) for j in judged]
     bare = run.roll(store, spec, None)
     waiting = [p for ps in (*pending, bare) for p in ps]
-    watch.add(f"{Path(spec.name).name}: {len(judged)} layouts", waiting)
+    watch.add(f"{Path(spec.name).name}: {count(len(judged), 'layout').lower()}", waiting)
     watch.wait(waiting)
     none = [p.result() for p in bare]
     for j, jobs in zip(judged, pending, strict=True):
