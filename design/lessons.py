@@ -63,9 +63,9 @@ class Lesson:
     def of(cls, run: Run, folder: Path, start: SimulatorSpec, judged: Sequence[Judged]) -> Lesson:
         """The lesson of `folder`. One that is done stays as it is, also if more is known now."""
         if (folder / CARD).exists():
-            dim = run.scene.dim - 1
+            empty = np.zeros((0, run.scene.dim - 1))
             about = read_card(folder)["refined"]
-            layouts = [np.array(x, dtype=float).reshape(-1, dim) for x in about["layouts"]]
+            layouts = [np.array(x, dtype=float) if x else empty for x in about["layouts"]]
             return cls(folder, start, tuple(judged), tuple(layouts))
         return cls(folder, start, tuple(judged), tuple(j.centres for j in judged))
 

@@ -147,8 +147,7 @@ def _told(
         for spec in (before, after)
         for part, judged in (("same", taught), ("new", new))
     }
-    best = [j.verified_cost for j in known if j.verified is not None and j.origin != "none"]
-    costs = [c for c in (j.verified_cost for j in new) if c is not None]
+    old = rank([j for j in known if j.verified is not None and j.origin != "none"])
     return {
         "model": lesson.folder.name,
         "from": Path(before.name).name,
@@ -161,8 +160,8 @@ def _told(
             }
             for part, judged in (("same", taught), ("new", new))
         },
-        "best_before": min((c for c in best if c is not None), default=None),
-        "best_found": min(costs, default=None),
+        "best_before": old[0].verified_cost if old else None,
+        "best_found": rank(new)[0].verified_cost if new else None,
         "rollouts": inner.summary["rollouts"],
         "backwards": inner.summary["backwards"],
         "reference_rollouts": inner.candidate_rollouts,
