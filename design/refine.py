@@ -23,7 +23,7 @@ import numpy as np
 from design.distinct import among
 from design.ensemble import Ensemble, is_learned
 from design.evaluators import SimulatorSpec
-from design.lessons import Lesson, teach, training_files
+from design.lessons import FEW, Lesson, teach, training_files
 from design.store import RolloutStore, Watch
 from design.summary import COMPLETE, PARTIAL
 from design.verify import Judged, gap, rank
@@ -99,6 +99,12 @@ def refine(run: Run, store: RolloutStore, workers: Workers, watch: Watch) -> Non
         lesson = Lesson.of(run, folder, spec, [j for j in known if j.verified is not None])
         with run.timed(f"refine {number}"):
             refined = teach(run, lesson, store, watch)
+        steps = lesson.spent()["steps"]
+        if steps < FEW:
+            run.note(
+                f"{folder.name} was trained for {steps} steps only, and below {FEW} a model rather "
+                "gets worse: give --refine-minutes more, or the machine less else to do"
+            )
         inner = Run(
             run.scene,
             folder,

@@ -259,7 +259,7 @@ class Run:
                     self.out.rmdir()
             raise
         if s.storage is not None and (there := len(self.log.trials())):
-            self._note(f"joined the study {s.study!r}, which held {there} trials")
+            self.note(f"joined the study {s.study!r}, which held {there} trials")
         self.scene.to_toml(self.out / "scene.toml")
 
     def simulate(self, workers: Workers, bar: Progress) -> None:
@@ -396,7 +396,7 @@ class Run:
             try:
                 own = [self._own(flow) for flow in self.flows]
             except SceneError as error:
-                self._note(f"the scene's own layout does not stand in every scenario: {error}")
+                self.note(f"the scene's own layout does not stand in every scenario: {error}")
             else:
                 found["paper"] = [store.start(spec, flow, trajectory=alone) for flow in own]
         return found
@@ -435,7 +435,8 @@ class Run:
             watch,
         )
 
-    def _note(self, line: str) -> None:
+    def note(self, line: str) -> None:
+        """Put a line on the notes of summary.json, once."""
         if line not in self.notes:
             self.notes.append(line)
 
@@ -564,7 +565,7 @@ class Run:
         found = {"constraints": constraints(scene, self.rules, ranked[0])}
         line = to_blame(self.rules, [t.outcome for t in trials if t.ok])
         if line:
-            self._note(line)
+            self.note(line)
         return found
 
     def _verify(

@@ -10,8 +10,13 @@ from typing import Any
 from design import page, wording
 from design.results import Design, RunResults
 
-#: The measures whose spread and gap are shown, after the objective.
-SHOWN = ("centroid_travel", "upstream_depth", "runout_p99", "mass_past_section")
+#: The measures whose spread and gap are shown after the objective, and their short names.
+SHOWN = {
+    "centroid_travel": "centroid travel",
+    "upstream_depth": "upstream depth",
+    "runout_p99": "runout p99",
+    "mass_past_section": "mass past",
+}
 
 
 def depth(run: RunResults) -> str:
@@ -22,10 +27,9 @@ def depth(run: RunResults) -> str:
         return ""
     marked = [d for d in judged if d.marks]
     limits = {k: float(v) for k, v in _dict(ensemble.get("limits")).items()}
-    names = {q.name: q.title for q in wording.quantities(run.scene)}
     shown = ["cost", *(n for n in SHOWN if any(n in d.spread for d in judged))]
     parts = [f"<h3>Where the {escape(run.searcher)} is out of its depth</h3>"]
-    members = [escape(Path(str(m)).name) for m in ensemble.get("members", [])]
+    members = [escape(_named(str(m))) for m in ensemble.get("members", [])]
     if members:
         said = (
             f"{wording.count(len(members), 'model')} ({', '.join(members)}) rolled out each of "
@@ -38,7 +42,7 @@ def depth(run: RunResults) -> str:
                 "nothing here: compare the layouts with each other."
             )
         parts.append(f'<p class="muted">{said}</p>')
-        head = ["", *("objective" if n == "cost" else escape(names[n].lower()) for n in shown)]
+        head = ["", *("objective" if n == "cost" else SHOWN[n] for n in shown)]
         head += ["gap of the<br>objective"]
         rows = [[_label(d), *(_spread(d, n, limits) for n in shown), _gap(d)] for d in judged]
         if limits:
@@ -77,7 +81,9 @@ def _round(run: RunResults, told: dict[str, Any]) -> str:
         ranks = [_rank(_dict(new.get(when)).get(name)) for when in ("before", "after")]
         if any(c != "–" for c in cells):
             rows.append([f'<span class="key">{escape(titles[name])}</span>', *cells, *ranks])
-    start, model = escape(str(told.get("from"))), escape(str(told.get("model")))
+    start, model = (
+        f'<span class="nowrap">{escape(str(told.get(key)))}</span>' for key in ("from", "model")
+    )
     head = [
         "mean |gap| to the solver",
         f"{same.get('layouts', 0)} layouts that it learned:<br>{start}",
@@ -104,6 +110,12 @@ def _round(run: RunResults, told: dict[str, Any]) -> str:
         f'<div class="card" style="margin-bottom:16px"><h3>Refined: {model}</h3>'
         f'<p class="muted">{said}</p>{page.table(head, rows)}</div>'
     )
+
+
+def _named(member: str) -> str:
+    """A shipped model, or a checkpoint folder by the name of its run."""
+    path = Path(member)
+    return path.parent.name if path.name in ("model", "last") and path.parent.name else path.name
 
 
 def _label(design: Design) -> str:

@@ -153,6 +153,7 @@ def test_the_gap_is_told_apart_for_taught_and_for_new_layouts(refined):
     assert told["same"]["before"] != told["same"]["after"]
     assert told["new"]["before"] != told["new"]["after"]
     assert told["steps"] > 0
+    assert any(f"trained for {told['steps']} steps only" in note for note in summary["notes"])
     assert summary["rollouts"] == 5 + told["rollouts"]
 
 
