@@ -16,7 +16,10 @@ from gns_model.polygon import clearance
 from gns_model.scene import TOLERANCE, Scene
 
 #: Limit on the flow -> what a reader calls it.
-WORDS = {"max_overtopping": "mass over the baffles' tops", "freeboard": "freeboard"}
+WORDS = {
+    "max_overtopping": "mass over the baffles' tops",
+    "freeboard": "tops above the deepest flow",
+}
 
 
 def constraints(scene: Scene, rules: Rules, judged: Judged) -> list[dict[str, Any]]:

@@ -175,7 +175,7 @@ def smooth_costs(
         own = (torch.tensor(task.space.size), torch.tensor(float(task.space.yaw)))
         forms = [own] * len(centres)
     scenes = [
-        task.scene.with_baffles(c.detach().numpy(), size=size.tolist(), yaw=float(yaw))
+        task.scene.with_baffles(c.detach().numpy(), size=size.tolist(), yaw=float(yaw.detach()))
         for c, (size, yaw) in zip(centres, forms, strict=True)
     ]
     simulator: Any = task.simulator

@@ -19,6 +19,7 @@ from gns_env.objective import Objective
 from gns_env.task import BaffleTask
 from gns_model import measures as hard
 from gns_model.errors import GnsError
+from gns_model.learned import LearnedModel, LearnedSimulator, ModelConfig
 from gns_model.smooth_measures import smooth_overtopping
 
 from .search_kit import FormulaSimulator, formula_scene
@@ -181,3 +182,26 @@ def test_the_table_of_constraints_says_value_and_margin():
     assert [name for name, row in by_name.items() if not row["holds"]] == ["max_overtopping"]
     assert by_name["max_volume"]["margin"] == pytest.approx(0.0065)
     assert by_name["max_overtopping"]["by"] == "search"
+
+
+def test_a_learned_simulator_is_differentiated_in_size_and_yaw():
+    torch.manual_seed(0)
+    config = ModelConfig(spacing=0.0625, radius=0.1, latent=8, blocks=1, dt=0.025)
+    scene = formula_scene(
+        duration=0.3,
+        release=[{"lower": [0, 0, 0.3], "upper": [0.3, 0.25, 1.3], "velocity": [2, 0, 0]}],
+        placement={"lower": [0.4, 0.0], "upper": [1.8, 1.6], "gap": 0.1,
+                   "vary": {"height": [0.1, 0.4], "across": [0.1, 0.3], "yaw": [-45, 45]}},
+    )  # fmt: skip
+    simulator = LearnedSimulator(LearnedModel(config))
+    task = BaffleTask(scene, simulator, n_baffles=2, objective=TRAVEL)
+    space = space_of(task)
+    layout = space.join([[0.55, 0.5], [0.6, 1.0]], type(space.form)((0.15, 0.3, 0.2), 20.0))
+    found = differentiate_flows([task], [layout], Risk(), Rules(), space)[0]
+    assert found.status == "ok"
+    assert found.gradient.shape == (2, 5)
+    assert np.isfinite(found.gradient).all()
+    across, yaw = found.gradient[0, 3:]
+    assert across != 0
+    assert yaw != 0
+    assert (found.gradient[0, 2:] == found.gradient[1, 2:]).all()  # one form for all
