@@ -18,6 +18,22 @@ from torch import Tensor
 
 from gns_model.learned.graph import radius_graph
 
+# Cosines with central differences of 2 cm, the mean of two starts, over 45 steps of the flume with
+# `baffle-lite`, for one start and the other; `benchmarks/gradients.py` prints them anew.
+#
+#     limit, smoothing    paper's layout    three askew
+#     none, 0             0.53              0.40
+#     6, 0                0.94, 0.77        0.81, -0.23
+#     6, 0.2              0.93, 0.97        0.99
+#     6, 0.35             0.88, 0.94        0.99
+#     6, 0.5              0.86, 0.90        0.99, 0.97
+#     6, 1                0.82              0.99
+#     3, 0.2              0.87, 0.85        0.97
+#
+# At 0.2 the length is right too, within a fifth. More sharing favours moves along the flow over
+# moves across it. What is still missing across the flow are the grains that just pass a baffle, or
+# just do not: no derivative of a path sees that it might have taken the other one.
+
 #: Limit of a grain's adjoint for design gradients over a whole flow, in medians of its scene.
 ADJOINT_LIMIT = 6.0
 #: Share of its adjoint that a grain gives to and takes from its neighbours in each step.
