@@ -121,7 +121,7 @@ def test_a_resumed_search_is_the_search_that_was_not_interrupted(tmp_path):
     halves.mkdir()
     c = campaign(whole, budget=24, seed=5)
     bayes.search(c)
-    bayes.search(campaign(halves, budget=16, seed=5))
+    bayes.search(campaign(halves, budget=24, seed=5), until=16)
     resumed = campaign(halves, budget=24, seed=5, resume=True)
     assert len(resumed.log.trials()) == 16
     bayes.search(resumed)
