@@ -38,6 +38,11 @@ app = typer.Typer(
 )
 
 
+#: Panels of --help.
+BUILD, SMALL = "What may be built", "What to make small"
+MANY, TRUST, RUN = "Many flows", "Trust", "The run"
+
+
 @app.command()
 def optimize(
     scene: SceneFile,
@@ -50,13 +55,16 @@ def optimize(
     ] = None,
     baffles: Annotated[
         Optional[int],  # noqa: UP045
-        typer.Option(help="How many baffles; default: as many as the scene has, or 3."),
+        typer.Option(
+            help="How many baffles; default: as many as the scene has, or 3.", rich_help_panel=BUILD
+        ),
     ] = None,
     number: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option(
             help="Range for the number of baffles, such as 2:6: the search chooses.",
             show_default=False,
+            rich_help_panel=BUILD,
         ),
     ] = None,
     vary: Annotated[
@@ -65,27 +73,41 @@ def optimize(
             help="Range of what the search may choose of the baffles' form, one for all: "
             "height=0.2:0.4, along=, across= (m) or yaw= (degrees); may be given several times.",
             show_default=False,
+            rich_help_panel=BUILD,
         ),
     ] = None,
     pattern: Annotated[
-        str, typer.Option(help="free, or rows: straight rows with stagger and spacing.")
+        str,
+        typer.Option(
+            help="free, or rows: straight rows with stagger and spacing.", rich_help_panel=BUILD
+        ),
     ] = "free",
     max_height: Annotated[
         Optional[float],  # noqa: UP045
-        typer.Option(help="Greatest height of a baffle in m.", show_default=False),
+        typer.Option(
+            help="Greatest height of a baffle in m.", show_default=False, rich_help_panel=BUILD
+        ),
     ] = None,
     max_volume: Annotated[
         Optional[float],  # noqa: UP045
-        typer.Option(help="Most concrete in all, in cubic metres.", show_default=False),
+        typer.Option(
+            help="Most concrete in all, in cubic metres.", show_default=False, rich_help_panel=BUILD
+        ),
     ] = None,
     wall_gap: Annotated[
         Optional[float],  # noqa: UP045
-        typer.Option(help="Least distance of a baffle to the walls in m.", show_default=False),
+        typer.Option(
+            help="Least distance of a baffle to the walls in m.",
+            show_default=False,
+            rich_help_panel=BUILD,
+        ),
     ] = None,
     max_overtopping: Annotated[
         Optional[float],  # noqa: UP045
         typer.Option(
-            help="Most mass that may go over the baffles' tops, as a share.", show_default=False
+            help="Most mass that may go over the baffles' tops, as a share.",
+            show_default=False,
+            rich_help_panel=SMALL,
         ),
     ] = None,
     freeboard: Annotated[
@@ -94,14 +116,19 @@ def optimize(
             help="Least height in m of the baffles' tops above the peak upstream depth; 0: it may "
             "be as deep as they are high.",
             show_default=False,
+            rich_help_panel=SMALL,
         ),
     ] = None,
     baffle_cost: Annotated[
-        float, typer.Option(help="Cost of each baffle, in units of the objective.")
+        float,
+        typer.Option(help="Cost of each baffle, in units of the objective.", rich_help_panel=SMALL),
     ] = 0.0,
     concrete_cost: Annotated[
         float,
-        typer.Option(help="Cost of a cubic metre of concrete, in units of the objective."),
+        typer.Option(
+            help="Cost of a cubic metre of concrete, in units of the objective.",
+            rich_help_panel=SMALL,
+        ),
     ] = 0.0,
     budget: Annotated[
         Optional[int],  # noqa: UP045
@@ -117,6 +144,7 @@ def optimize(
             help="Two or more of runout, p99, depth and mass, such as runout,depth: search for "
             "their Pareto front.",
             show_default=False,
+            rich_help_panel=SMALL,
         ),
     ] = None,
     scenarios: Annotated[
@@ -124,6 +152,7 @@ def optimize(
         typer.Option(
             help="Make the risk over so many flows small, drawn from the three ranges below.",
             show_default=False,
+            rich_help_panel=MANY,
         ),
     ] = None,
     speed: Annotated[
@@ -131,6 +160,7 @@ def optimize(
         typer.Option(
             help="Range of the release's speed in m/s; default: 0.8 to 1.2 times the scene's.",
             show_default=False,
+            rich_help_panel=MANY,
         ),
     ] = None,
     volume: Annotated[
@@ -138,6 +168,7 @@ def optimize(
         typer.Option(
             help="Range of the volume, relative to the scene's; default: 0.8:1.2.",
             show_default=False,
+            rich_help_panel=MANY,
         ),
     ] = None,
     friction: Annotated[
@@ -146,6 +177,7 @@ def optimize(
             help="Range of the friction angle in degrees; default: 5 less to 5 more than the "
             "scene's. The default ranges keep to what a learned simulator was trained for.",
             show_default=False,
+            rich_help_panel=MANY,
         ),
     ] = None,
     risk: Annotated[
@@ -153,6 +185,7 @@ def optimize(
         typer.Option(
             help="mean of the scenarios' costs, or cvar: the mean of the worst; default: mean.",
             show_default=False,
+            rich_help_panel=MANY,
         ),
     ] = None,
     cvar_level: Annotated[
@@ -160,15 +193,23 @@ def optimize(
         typer.Option(
             help="Share of the scenarios that the CVaR leaves out, the best ones; default: 0.8.",
             show_default=False,
+            rich_help_panel=MANY,
         ),
     ] = None,
     verify: Annotated[
-        int, typer.Option(help="How many of the best the reference solver judges; 0: none.")
+        int,
+        typer.Option(
+            help="How many of the best the reference solver judges; 0: none.", rich_help_panel=TRUST
+        ),
     ] = 4,
     seed: Annotated[int, typer.Option(help="Seed of everything random.")] = 0,
     out: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(help="Run folder; default: runs/<name of the scene>.", show_default=False),
+        typer.Option(
+            help="Run folder; default: runs/<name of the scene>.",
+            show_default=False,
+            rich_help_panel=RUN,
+        ),
     ] = None,
     storage: Annotated[
         Optional[str],  # noqa: UP045
@@ -177,25 +218,35 @@ def optimize(
             "given the same one share the search and its budget, each with an --out of its own; "
             "default: SQLite in the run folder.",
             show_default=False,
+            rich_help_panel=RUN,
         ),
     ] = None,
     study: Annotated[
-        str, typer.Option(help="Name of the study in --storage, one for each problem.")
+        str,
+        typer.Option(
+            help="Name of the study in --storage, one for each problem.", rich_help_panel=RUN
+        ),
     ] = "gns-design",
     grace: Annotated[
         int,
         typer.Option(
             help="Seconds without a sign of life after which the trials of another worker on "
-            "--storage are tried again."
+            "--storage are tried again.",
+            rich_help_panel=RUN,
         ),
     ] = 60,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with what the run folder and storage hold.")
+        bool,
+        typer.Option(
+            "--resume", help="Go on with what the run folder and storage hold.", rich_help_panel=RUN
+        ),
     ] = False,
     simulator: Simulator = "baffle-lite",
     spacing: Spacing = None,
     device: Device = "cpu",
-    verify_with: Annotated[str, typer.Option(help="Who judges the best layouts.")] = "mpm",
+    verify_with: Annotated[
+        str, typer.Option(help="Who judges the best layouts.", rich_help_panel=TRUST)
+    ] = "mpm",
     verify_spacing: Spacing = None,
     runout_weight: Weight = None,
     depth_weight: Weight = None,
@@ -203,7 +254,11 @@ def optimize(
     batch: Annotated[int, typer.Option(help="Layouts proposed at a time.")] = 8,
     workers: Annotated[
         Optional[int],  # noqa: UP045
-        typer.Option(help="Processes of one thread; default: one a core.", show_default=False),
+        typer.Option(
+            help="Processes of one thread; default: one a core.",
+            show_default=False,
+            rich_help_panel=RUN,
+        ),
     ] = None,
     ensemble: Annotated[
         Optional[list[str]],  # noqa: UP045
@@ -212,6 +267,7 @@ def optimize(
             "folders, again for each or with commas; none: nobody. Default: those that the model's "
             "card names.",
             show_default=False,
+            rich_help_panel=TRUST,
         ),
     ] = None,
     refine: Annotated[
@@ -219,11 +275,15 @@ def optimize(
         typer.Option(
             "--refine",
             help="Train the model on the verified layouts, then search and verify again.",
+            rich_help_panel=TRUST,
         ),
     ] = False,
-    refine_rounds: Annotated[int, typer.Option(help="How often, with --refine.")] = 1,
+    refine_rounds: Annotated[
+        int, typer.Option(help="How often, with --refine.", rich_help_panel=TRUST)
+    ] = 1,
     refine_minutes: Annotated[
-        float, typer.Option(help="Minutes of training in each round of --refine.")
+        float,
+        typer.Option(help="Minutes of training in each round of --refine.", rich_help_panel=TRUST),
     ] = 5.0,
     refine_data: Annotated[
         Optional[Path],  # noqa: UP045
@@ -231,9 +291,12 @@ def optimize(
             help="Folder of trajectories that --refine mixes in, so that the model does not forget "
             "them; default: none.",
             show_default=False,
+            rich_help_panel=TRUST,
         ),
     ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress, no table.")] = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", help="No progress, no table.", rich_help_panel=RUN)
+    ] = False,
 ) -> None:
     """Search for a layout of baffles, verify the best on the reference solver, write a report."""
     with console.clean_errors():

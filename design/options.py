@@ -24,6 +24,7 @@ Weight = Annotated[
     typer.Option(
         help="Weight of this measure, relative to no baffles; default: the objective's.",
         show_default=False,
+        rich_help_panel="What to make small",
     ),
 ]
 Device = Annotated[
