@@ -177,7 +177,7 @@ def print_correlations(judged: Sequence[Judgement], limits: dict[str, float]) ->
     one, mean = (np.array([getattr(j, k) for j in unseen]) for k in ("first_cost", "mean_cost"))
     print(
         "Rank correlation of the objective with the truth, unseen layouts: the model alone "
-        f"{spearman(one, true)}, mean of all {spearman(mean, true)}"
+        f"{spearman(one, true) or 0:.3f}, mean of all {spearman(mean, true) or 0:.3f}"
     )
 
 
