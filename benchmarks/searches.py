@@ -284,6 +284,7 @@ def figure(rows: Sequence[dict[str, str]], budget: int, path: Path) -> None:
     """Mean least cost so far against passes, one panel a scene, with 95% bands."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     from design.theme import LIGHT
 
@@ -308,12 +309,15 @@ def figure(rows: Sequence[dict[str, str]], budget: int, path: Path) -> None:
                     passes, mean, where="post", color=colour, ls=(0, dash) if dash[1] else "-",
                     lw=2.4 if top else 1.5, label=method, zorder=5 if top else 4,
                 )  # fmt: skip
-                ends.append((mean[-1], mean[min(4, budget - 1)]))
-            low, high = min(e for e, _ in ends), max(s for _, s in ends)
+                ends.append((mean[-1] - half[-1], mean[0]))
+            # Chance alone starts far above what everybody else begins with, the first row: what
+            # counts is below that, and the rest is cut off.
+            low, high = min(e for e, _ in ends), min(s for _, s in ends)
             axes.set(
                 title=scene, xlabel="passes: rollouts and backward passes", xlim=(1, budget),
-                ylim=(low - 0.25 * (high - low), high + 0.6 * (high - low)),
+                ylim=(low - 0.2 * (high - low), high + 0.8 * (high - low)),
             )  # fmt: skip
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         panels[0].set_ylabel("least cost so far [-], mean of seeds and 95% interval")
         panels[-1].legend(ncols=2, loc="upper right")
         drawing.savefig(path, dpi=150)
