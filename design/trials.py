@@ -178,7 +178,7 @@ class TrialLog:
             log._backend = backend
             if owned:
                 for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
-                    log._lose(trial._trial_id, bool(trial.params))
+                    log._lose(trial._trial_id, log._whole(trial))
         return log
 
     def close(self) -> None:
@@ -324,7 +324,7 @@ class TrialLog:
             del self._asked[number]
             if self._heart is not None:
                 self._heart.forget(trial_id)
-            self._lose(trial_id, bool(self.study._storage.get_trial(trial_id).params))
+            self._lose(trial_id, self._whole(self.study._storage.get_trial(trial_id)))
 
     def buildable(self, centres: np.ndarray) -> np.ndarray:
         """The nearest layout that holds every constraint, numbered across the flow."""
@@ -406,6 +406,10 @@ class TrialLog:
                 self.study._storage.set_trial_user_attr(trial_id, ledger.LOST, True)
             self.study._storage.set_trial_state_values(trial_id, TrialState.FAIL)
 
+    def _whole(self, trial: FrozenTrial) -> bool:
+        """Whether a trial has a layout: a worker may die while it writes one parameter by one."""
+        return self.distributions.keys() <= trial.params.keys()
+
     def _note_the_lost(self) -> None:
         """Enqueue what dead workers left: also what one left that died while noting this."""
         if self._heart is not None:
@@ -414,7 +418,7 @@ class TrialLog:
             for trial_id in self._heart.stale(self.study._study_id):
                 trial = self.study._storage.get_trial(trial_id)
                 if trial.number not in self._asked:
-                    self._lose(trial_id, bool(trial.params))
+                    self._lose(trial_id, self._whole(trial))
         for trial in ledger.lost(self._all()):
             record = trial.user_attrs.get(ledger.RECORD) or {}
             origin = trial.user_attrs.get(ledger.ORIGIN) or record.get("origin") or "again"

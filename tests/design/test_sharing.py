@@ -114,8 +114,11 @@ def kill_within_a_trial(storage, name, pid, after=0):
 
 
 def runs(trials, pid):
-    """Numbers of the trials that a process runs, of those that it was admitted to."""
-    mine = [t for t in trials if t.state.name == "RUNNING" and ledger.DROPPED not in t.user_attrs]
+    """Numbers of the trials that a process runs, of those that it was admitted to and that have a
+    layout: the parameters are written one by one."""
+    most = max((len(t.params) for t in trials), default=0)
+    mine = [t for t in trials if t.state.name == "RUNNING" and len(t.params) == most]
+    mine = [t for t in mine if ledger.DROPPED not in t.user_attrs]
     return {t.number for t in mine if t.user_attrs.get(ledger.WORKER, "").endswith(f"-{pid}")}
 
 
@@ -220,6 +223,19 @@ def test_whoever_asks_tells_or_dies_when_the_budget_is_spent_and_no_more(steps, 
     assert lost <= {t.user_attrs.get(ledger.RETRY_OF) for t in frozen}
     places = [tuple(t.centres.ravel()) for t in told if t.origin == "row"]
     assert len(places) == len(set(places))
+
+
+def test_a_trial_without_a_whole_layout_is_let_go(tmp_path):
+    """A worker died between two parameters: there is no layout to try again, and no error."""
+    space, address = LayoutSpace(formula_scene(), 2), sqlite_url(tmp_path / "s.db")
+    log = TrialLog.open(address, "t", space, {"n": 2}, resume=False, owned=True)
+    trial = log.study.ask()
+    trial.suggest_float("x1", 0.0, 1.0)
+    log.close()
+    again = TrialLog.open(address, "t", space, {"n": 2}, resume=True, owned=True)
+    assert again.again(4) == []
+    assert [t.state.name for t in again.study.get_trials()] == ["FAIL"]
+    again.close()
 
 
 def test_a_layout_that_kills_its_worker_is_given_up(tmp_path):
