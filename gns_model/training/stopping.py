@@ -17,6 +17,8 @@ from types import FrameType
 #: Seconds that a step may still take after the request. Together with the time to save, and with
 #: the single operations that Python cannot interrupt, this stays below the 10 s that we promise.
 GRACE = 4.0
+#: Seconds until a step that was to be given up, and goes on all the same, is given up once more.
+AGAIN = 0.5
 
 
 class Abandoned(BaseException):
@@ -35,14 +37,20 @@ class Stop:
         """Ask for the end: a signal handler. A second request does not wait for the step."""
         if not self.requested:
             self.requested = True
-            # Comes back to the main thread as the same signal would.
-            self._timer = threading.Timer(GRACE, _thread.interrupt_main, (signal.SIGTERM,))
-            self._timer.daemon = True
-            self._timer.start()
+            self._come_back(GRACE)
             return
         self._late = True
         if self._free:
+            # Raised in a destructor or a callback it would be ignored: then once more.
+            self._come_back(AGAIN)
             raise Abandoned
+
+    def _come_back(self, seconds: float) -> None:
+        """Come back to the main thread as the same signal would."""
+        self.close()
+        self._timer = threading.Timer(seconds, _thread.interrupt_main, (signal.SIGTERM,))
+        self._timer.daemon = True
+        self._timer.start()
 
     @contextmanager
     def may_abandon(self) -> Iterator[None]:

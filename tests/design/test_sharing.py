@@ -88,8 +88,9 @@ def worker(storage, method, budget, salt, until):
     log.close()
 
 
-def kill_within_a_trial(storage, name, pid, after=0):
-    """End a worker that runs trials, once so many are told; the study, and their numbers."""
+def kill_within_a_trial(storage, name, pids, after=0):
+    """End the first of some workers that runs trials, once so many are told: the study, the
+    trials' numbers, and which worker it was."""
     address = storage.replace("postgresql:", "postgresql+psycopg:")
     study, end = None, time.monotonic() + 300
     while time.monotonic() < end:
@@ -99,8 +100,10 @@ def kill_within_a_trial(storage, name, pid, after=0):
         except Exception:  # it is being made
             continue
         trials = study.get_trials(deepcopy=False)
-        if sum(t.state.name == "COMPLETE" for t in trials) < after or not runs(trials, pid):
+        busy = [k for k, pid in enumerate(pids) if runs(trials, pid)]
+        if sum(t.state.name == "COMPLETE" for t in trials) < after or not busy:
             continue
+        pid = pids[busy[0]]
         os.kill(pid, signal.SIGSTOP)  # so that it is in the middle when it is looked at
         time.sleep(0.2)
         try:
@@ -109,7 +112,7 @@ def kill_within_a_trial(storage, name, pid, after=0):
             asked = set()
         os.kill(pid, signal.SIGKILL if asked else signal.SIGCONT)
         if asked:
-            return study, asked
+            return study, asked, busy[0]
     raise AssertionError("it ran no trial")
 
 
@@ -137,7 +140,7 @@ def test_workers_share_a_budget_and_one_is_killed(storage, method):
     ]
     for process in workers:
         process.start()
-    study, asked = kill_within_a_trial(storage, "test", workers[0].pid, after=6)
+    study, asked, _ = kill_within_a_trial(storage, "test", [workers[0].pid], after=6)
     for process in workers[1:]:
         process.join(300)
     assert [p.exitcode for p in workers] == [-signal.SIGKILL, 0, 0]
@@ -315,24 +318,27 @@ def test_the_command_on_two_machines_of_which_one_dies(server, scene_file, tmp_p
     """`gns-design optimize --storage postgresql://…` twice; one is killed within a rollout."""
     storage = new_database(server)
     more = ["--budget", "14", "--batch", "4", "--method", "random"]
-    first, second = (
+    names = ["first", "second"]
+    processes = [
         subprocess.Popen(
             [sys.executable, "-c", COMMAND, "optimize", scene_file]
             + options(storage, tmp_path / name, *more),
             cwd=Path(__file__).parents[2], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         )
-        for name in ("first", "second")
-    )  # fmt: skip
-    study, asked = kill_within_a_trial(storage, "gns-design", first.pid)
-    first.communicate()
-    out, err = second.communicate(timeout=300)
-    assert second.returncode == 0, err
+        for name in names
+    ]  # fmt: skip
+    pids = [process.pid for process in processes]
+    study, asked, killed = kill_within_a_trial(storage, "gns-design", pids)
+    processes.pop(killed).communicate()
+    dead, alive = names.pop(killed), names[0]
+    out, err = processes[0].communicate(timeout=300)
+    assert processes[0].returncode == 0, err
     assert postgres.PASSWORD.encode() not in out + err
-    summary = json.loads((tmp_path / "second" / "summary.json").read_text())
+    summary = json.loads((tmp_path / alive / "summary.json").read_text())
     assert summary["status"] == "complete"
     assert summary["rollouts"] == 14
     assert postgres.PASSWORD not in json.dumps(summary)
-    assert not (tmp_path / "first" / "summary.json").exists()
+    assert not (tmp_path / dead / "summary.json").exists()
     trials = study.get_trials()
     assert not [t for t in trials if t.state.name in ("RUNNING", "WAITING")]
     lost = {t.number for t in trials if t.user_attrs.get(ledger.LOST)}
@@ -341,8 +347,8 @@ def test_the_command_on_two_machines_of_which_one_dies(server, scene_file, tmp_p
     assert asked <= lost
 
     # What is another's, or of another problem, is refused; nothing is touched.
-    held = claim(tmp_path / "second")
-    line = refused(capsys, scene_file, *options(storage, tmp_path / "second", "--resume"))
+    held = claim(tmp_path / alive)
+    line = refused(capsys, scene_file, *options(storage, tmp_path / alive, "--resume"))
     assert "--out of its own" in line
     release(held)
     before = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*")}

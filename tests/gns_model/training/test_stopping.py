@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -71,6 +72,24 @@ def test_a_step_that_takes_too_long_is_given_up_and_nothing_is_lost(tiny, tmp_pa
     assert read_position(tmp_path / "state.safetensors").step == 2
     train(recipe.model_copy(update={"steps": 3}), tmp_path)
     assert read_position(tmp_path / "state.safetensors").step == 3
+
+
+def test_a_request_that_somebody_swallows_comes_again(monkeypatch):
+    """A signal may arrive in a destructor, where Python ignores what is raised."""
+    monkeypatch.setattr(stopping, "GRACE", 0.0)
+    monkeypatch.setattr(stopping, "AGAIN", 0.05)
+    with stop_on_signals() as stop:
+        timer = terminate_after(0.05)
+
+        def deaf() -> None:
+            with stop.may_abandon():
+                with contextlib.suppress(Abandoned):
+                    wait(20.0)
+                wait(20.0)
+
+        with pytest.raises(Abandoned):
+            deaf()
+        timer.join()
 
 
 def test_a_stop_in_the_middle_of_a_validation_saves_and_ends(tiny, tmp_path, monkeypatch):
