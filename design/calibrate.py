@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -22,45 +22,39 @@ def calibrate(
     parameter: Annotated[
         Literal["friction", "velocity"],
         typer.Option(
-            help="What to find: the friction angle, or the velocity of the releases in plan.",
-            show_default=False,
+            help="What to find: the friction angle, or the velocity of the releases in plan."
         ),
     ],
     target: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option(
             help="Deposit to match: a trajectory file (.h5; its last frame counts), or a CSV of "
-            "points of equal mass with the columns x, y, z in metres.",
-            show_default=False,
+            "points of equal mass with the columns x, y, z in metres."
         ),
     ] = None,
     runout: Annotated[
-        Optional[float],  # noqa: UP045
+        float | None,
         typer.Option(
-            help="Or the runout to match: travel of the front of 99% of the material in m.",
-            show_default=False,
+            help="Or the runout to match: travel of the front of 99% of the material in m."
         ),
     ] = None,
     simulator: Annotated[
-        Optional[str],  # noqa: UP045
+        str | None,
         typer.Option(
             help="mpm, a shipped model, or a checkpoint folder; default: the shipped model of this "
-            "dimension that sees the parameter, else mpm.",
-            show_default=False,
+            "dimension that sees the parameter, else mpm."
         ),
     ] = None,
     method: Annotated[
-        Optional[Literal["gradient", "differences"]],  # noqa: UP045
+        Literal["gradient", "differences"] | None,
         typer.Option(
             help="Slopes by autograd or by finite differences; default: gradient where the "
-            "simulator has one.",
-            show_default=False,
+            "simulator has one."
         ),
     ] = None,
     budget: Annotated[int, typer.Option(min=1, help="Most values to try.")] = 12,
     out: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option(help="Write the scene with what was found (TOML).", show_default=False),
+        Path | None, typer.Option(help="Write the scene with what was found (TOML).")
     ] = None,
     spacing: options.Spacing = None,
     device: options.Device = "cpu",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -17,35 +17,31 @@ if TYPE_CHECKING:
 def evaluate(
     scene: options.SceneFile,
     layout: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option(
             help="TOML file whose baffle tables stand in place of the scene's, such as "
-            "layouts/best.toml of a run; nothing else in it is read.",
-            show_default=False,
+            "layouts/best.toml of a run; nothing else in it is read."
         ),
     ] = None,
     baffles: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option(
             help="Mesh of walls (STL, PLY, OBJ, OFF, GLB; metres) in place of the scene's baffles. "
             "Each closed body has to be a box along the axes that stands on the base: only "
-            "these are simulated exactly, and anything else is refused.",
-            show_default=False,
+            "these are simulated exactly, and anything else is refused."
         ),
     ] = None,
     up: Annotated[
-        Optional[Literal["y", "z"]],  # noqa: UP045
+        Literal["y", "z"] | None,
         typer.Option(
             help="Axis of the mesh that points up; default: y for GLB, z for the others, as "
-            "gns-design writes them.",
-            show_default=False,
+            "gns-design writes them."
         ),
     ] = None,
     vtk: Annotated[
-        Optional[Path],  # noqa: UP045
+        Path | None,
         typer.Option(
-            help="Also write the flow with these baffles for ParaView (VTKHDF, *.vtkhdf).",
-            show_default=False,
+            help="Also write the flow with these baffles for ParaView (VTKHDF, *.vtkhdf)."
         ),
     ] = None,
     simulator: options.Simulator = "mpm",

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -11,25 +12,27 @@ if TYPE_CHECKING:
     from design.evaluators import SimulatorSpec
     from gns_env.objective import Objective
 
-SceneFile = Annotated[Path, typer.Argument(help="Scene file (TOML).", show_default=False)]
+#: An option in a panel of --help.
+build = partial(typer.Option, rich_help_panel="What may be built")
+small = partial(typer.Option, rich_help_panel="What to make small")
+many = partial(typer.Option, rich_help_panel="Many flows")
+trust = partial(typer.Option, rich_help_panel="Trust")
+run = partial(typer.Option, rich_help_panel="The run")
+
+SceneFile = Annotated[Path, typer.Argument(help="Scene file (TOML).")]
 Simulator = Annotated[
     str, typer.Option(help="mpm, a shipped model such as baffle-lite, or a checkpoint folder.")
 ]
 Spacing = Annotated[
-    Optional[float],  # noqa: UP045  (typer reads it at run time, also on Python 3.11)
+    float | None,
     typer.Option(help="Spacing of points for mpm in m; default: the solver's fine one."),
 ]
 Weight = Annotated[
-    Optional[float],  # noqa: UP045
-    typer.Option(
-        help="Weight of this measure, relative to no baffles; default: the objective's.",
-        show_default=False,
-        rich_help_panel="What to make small",
-    ),
+    float | None,
+    small(help="Weight of this measure, relative to no baffles; default: the objective's."),
 ]
 Device = Annotated[
-    str,
-    typer.Option(help="torch device of the simulator: cpu or cuda; mpm has a solver for each."),
+    str, typer.Option(help="torch device of the simulator: cpu or cuda; mpm has a solver for each.")
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress.")]
