@@ -7,6 +7,8 @@ improving goes back to its best layout with half of that.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+
 import numpy as np
 
 from design.space import Space
@@ -22,7 +24,7 @@ LEAST_STEP = 0.003
 HELD = 0.02
 
 
-class Chain:
+class Chain(ABC):
     """One start of a descent. `centres` [m], shape (n, D-1), is the layout to differentiate next.
 
     Where the form varies, its columns follow (see `space`), and a step changes it too: `project`
@@ -79,17 +81,18 @@ class Chain:
             moved = self._space.project(self.centres + moved * (asked / most)) - self.centres
         self.centres = self.centres + moved
 
-    def _observe(self, gradient: np.ndarray) -> None:
+    def _observe(self, gradient: np.ndarray) -> None:  # noqa: B027  (not every kind remembers it)
         """Take note of the gradient [1/m], shape (n, D-1), at `centres`."""
 
+    @abstractmethod
     def _direction(self, gradient: np.ndarray) -> np.ndarray:
         """What to subtract from `centres` [m], shape (n, D-1), at most `step` in a coordinate."""
-        raise NotImplementedError
 
     def _go_back(self) -> None:
         """Take note that the chain is back at its best layout."""
         self._forget()
 
+    @abstractmethod
     def _forget(self) -> None:
         """Forget the way so far."""
 
