@@ -68,7 +68,7 @@ class Lesson:
     def of(cls, run: Run, folder: Path, start: SimulatorSpec, judged: Sequence[Judged]) -> Lesson:
         """The lesson of `folder`. One that is done stays as it is, also if more is known now."""
         if (folder / CARD).exists():
-            empty = np.zeros((0, run.scene.dim - 1))
+            empty = np.zeros((0, run.problem.scene.dim - 1))
             about = read_card(folder)["refined"]
             layouts = [np.array(x, dtype=float) if x else empty for x in about["layouts"]]
             return cls(folder, start, tuple(judged), tuple(layouts))
@@ -169,7 +169,7 @@ def training_files(folder: Path) -> list[Path]:
 def _lay_out(run: Run, lesson: Lesson, store: RolloutStore, watch: Watch) -> list[Scene]:
     """Link the reference trajectories of the verified layouts into RUN/refined-k/lessons."""
     verifier = run.settings.verifier
-    pending = [p for j in lesson.judged for p in run.roll(store, verifier, j, trajectory=True)]
+    pending = [p for j in lesson.judged for p in store.roll(verifier, run.problem.laid_out(j))]
     watch.add(f"{lesson.folder.name}: trajectories", pending)
     watch.wait(pending)
     folder = lesson.folder / "lessons"

@@ -24,6 +24,7 @@ from design.distinct import among
 from design.ensemble import Ensemble, is_learned
 from design.evaluators import SimulatorSpec
 from design.lessons import FEW, Lesson, teach, training_files
+from design.stages import judge
 from design.store import RolloutStore, Watch
 from design.summary import COMPLETE, PARTIAL
 from design.verify import Judged, gap, rank
@@ -71,7 +72,7 @@ def check(run: Run) -> None:
         )
     config: Any = s.simulator.load().config  # type: ignore[attr-defined]
     solver: Any = s.verifier.load()
-    fine = solver.chosen.spacing_of(run.scene)
+    fine = solver.chosen.spacing_of(run.problem.scene)
     for what, mine, theirs, unit in (
         ("spacing", config.spacing, fine, "m"),
         ("frame interval", config.dt, solver.chosen.frame_interval, "s"),
@@ -106,7 +107,7 @@ def refine(run: Run, store: RolloutStore, workers: Workers, watch: Watch) -> Non
                 "gets worse: give --refine-minutes more, or the machine less else to do"
             )
         inner = Run(
-            run.scene,
+            run.problem.scene,
             folder,
             # A refined model is this worker's own, so its search is shared with nobody.
             replace(s, simulator=refined, refine=0, resume=True, storage=None),
@@ -118,9 +119,9 @@ def refine(run: Run, store: RolloutStore, workers: Workers, watch: Watch) -> Non
             ),
         )
         inner.open()
-        searched, _ = inner.judge(store, workers, watch)
+        searched, _ = judge(inner, store, workers, watch)
         # A resumed round reads what its search is relative to.
-        run.kept |= {p.result().path for pending in searched.values() for p in pending}
+        run.kept |= {p.result().path for p in searched.pending}
         inner.write(COMPLETE)
         inner.close()
         found = [j for j in inner.ranked if not among(j.centres, [k.centres for k in known])]
@@ -178,13 +179,14 @@ def _seen_by(
     run: Run, spec: SimulatorSpec, judged: Sequence[Judged], store: RolloutStore, watch: Watch
 ) -> Iterator[Judged]:
     """The layouts with the numbers of `spec` in place of those that they were found by."""
-    pending = [run.roll(store, spec, j) for j in judged]
-    bare = run.roll(store, spec, None)
+    problem = run.problem
+    pending = [store.roll(spec, problem.laid_out(j), trajectory=False) for j in judged]
+    bare = store.roll(spec, problem.laid_out(None), trajectory=False)
     waiting = [p for ps in (*pending, bare) for p in ps]
     watch.add(f"{Path(spec.name).name}: {count(len(judged), 'layout').lower()}", waiting)
     watch.wait(waiting)
     none = [p.result() for p in bare]
     for j, jobs in zip(judged, pending, strict=True):
-        outcome = run.weigh([p.result() for p in jobs], none)
+        outcome = problem.weigh([p.result() for p in jobs], none)
         if outcome.status == "ok":
             yield replace(j, surrogate=dict(outcome.measures), cost=outcome.cost)

@@ -114,6 +114,16 @@ class Scenarios:
             drawn.append(replace(own, **values))
         return drawn, notes
 
+    def describe(self) -> dict[str, Any]:
+        """The options that drew the scenarios, as words for the same command."""
+        ranges = {name: getattr(self, name) for name in ("speed", "volume", "friction")}
+        return {
+            "count": self.count,
+            **{name: f"{r[0]:g}:{r[1]:g}" for name, r in ranges.items() if r is not None},
+            "risk": self.risk.kind,
+            **({"level": self.risk.level} if self.risk.kind == "cvar" else {}),
+        }
+
 
 def scenes(scene: Scene, drawn: list[Scenario]) -> list[Scene]:
     """The scene with each flow of `drawn`.

@@ -85,6 +85,12 @@ class RolloutStore:
             return Pending(path, None)
         return Pending(path, self._workers.submit(simulate_job, spec, values, path))
 
+    def roll(
+        self, spec: SimulatorSpec, flows: Sequence[Scene], *, trajectory: bool = True
+    ) -> list[Pending]:
+        """`start` each of `flows`, such as a layout in several scenarios."""
+        return [self.start(spec, flow, trajectory=trajectory) for flow in flows]
+
     def name(self, rolled: Rolled, stem: str) -> None:
         """Let `trajectories/<stem>.h5` be this rollout's trajectory."""
         link = self.folder / "trajectories" / f"{stem}.h5"

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from design import run as run_module
-from design.evaluators import SimulatorSpec
+from design.evaluators import InWorkers, SimulatorSpec
 from design.measure import measure
 from design.run import optimise
 from design.settings import SettingError, Settings
@@ -191,7 +191,7 @@ def test_a_device_runs_batches_in_this_process(scene, checkpoint, tmp_path, no_r
 def test_an_interrupt_leaves_a_summary_and_the_next_run_goes_on(
     scene, tmp_path, monkeypatch, no_report
 ):
-    evaluate = run_module.InWorkers.evaluate
+    evaluate = InWorkers.evaluate
     calls = []
 
     def stop_in_the_second_batch(self, layouts):
@@ -203,7 +203,7 @@ def test_an_interrupt_leaves_a_summary_and_the_next_run_goes_on(
 
     settings = Settings(budget=14, verify=1, simulator=COARSE, verifier=COARSE, workers=1, batch=6)
     with monkeypatch.context() as patched:
-        patched.setattr(run_module.InWorkers, "evaluate", stop_in_the_second_batch)
+        patched.setattr(InWorkers, "evaluate", stop_in_the_second_batch)
         with pytest.raises(KeyboardInterrupt):
             optimise(scene, tmp_path, settings)
     summary = json.loads((tmp_path / "summary.json").read_text())
