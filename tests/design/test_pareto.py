@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import design
-from design.evaluators import SimulatorSpec
 from design.objectives import joined, parse, split
 from design.pareto import front, hypervolume, spread, staircase
 from design.results import RunResults
@@ -23,8 +22,7 @@ from gns_model.errors import SimulatorError
 from gns_model.scene import Scene
 
 from .search_kit import FormulaSimulator, formula_scene
-
-COARSE = SimulatorSpec("mpm", options=(("spacing", 0.0625),))
+from .short_runs import COARSE, short_flume
 
 
 def trials(costs, statuses=None):
@@ -129,23 +127,7 @@ def done(small_scene, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def small_scene():
-    """A short flume in which a row dams the flow."""
-    return Scene.from_dict(
-        {
-            "name": "short",
-            "duration": 0.3,
-            "section": 0.8,
-            "domain": {"lower": [0.1, 0.1, 0.1], "upper": [1.5, 0.9, 1.1]},
-            "release": [
-                {"lower": [0.1, 0.1, 0.3], "upper": [0.45, 0.35, 0.9], "velocity": [2, 0, 0]}
-            ],
-            "baffle": [
-                {"center": [0.9, 0.3], "size": [0.15, 0.3, 0.15]},
-                {"center": [0.9, 0.9], "size": [0.15, 0.3, 0.15]},
-            ],
-            "placement": {"lower": [0.55, 0.1], "upper": [1.3, 1.1], "gap": 0.1},
-        }
-    )
+    return short_flume()  # its row dams the flow
 
 
 def test_a_run_leaves_every_point_of_its_front(done):

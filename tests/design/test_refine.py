@@ -4,6 +4,7 @@ import json
 import os
 import signal
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,39 +17,27 @@ from design.evaluators import SimulatorSpec
 from design.run import Run, optimise
 from design.settings import SettingError, Settings
 from gns_model.errors import FileFormatError, SimulatorError
-from gns_model.learned import LearnedModel, ModelConfig, save_model
 from gns_model.learned.checkpoint import load_model, read_card
 from gns_model.scene import Scene
 from gns_model.training.state import read_position
 
-COARSE = SimulatorSpec("mpm", options=(("spacing", 0.0625),))
+from .short_runs import COARSE, baffle_at, short_flume, tiny_model
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    """A short flume of some hundred coarse points with one baffle."""
-    return Scene.from_dict(
-        {
-            "name": "short",
-            "duration": 0.2,
-            "section": 0.6,
-            "domain": {"lower": [0.1, 0.1, 0.1], "upper": [1.3, 0.7, 0.9]},
-            "release": [
-                {"lower": [0.1, 0.1, 0.2], "upper": [0.4, 0.3, 0.7], "velocity": [2, 0, 0]}
-            ],
-            "baffle": [{"center": [0.9, 0.5], "size": [0.15, 0.3, 0.15]}],
-            "placement": {"lower": [0.45, 0.1], "upper": [1.2, 0.9], "gap": 0.1},
-        }
+    """The short flume, shorter still, with one baffle."""
+    return short_flume(
+        duration=0.2,
+        section=0.6,
+        domain={"lower": [0.1, 0.1, 0.1], "upper": [1.3, 0.7, 0.9]},
+        release=[{"lower": [0.1, 0.1, 0.2], "upper": [0.4, 0.3, 0.7], "velocity": [2, 0, 0]}],
+        baffle=[baffle_at(0.9, 0.5)],
+        placement={"lower": [0.45, 0.1], "upper": [1.2, 0.9], "gap": 0.1},
     )
 
 
-def tiny(folder, seed=0, **card):
-    """A learned simulator that has learnt nothing."""
-    torch.manual_seed(seed)
-    config = ModelConfig(
-        spacing=0.0625, radius=0.1, latent=8, blocks=1, dt=0.02, limits={"max_speed": 1.0}
-    )
-    return save_model(folder, LearnedModel(config), card)
+tiny = partial(tiny_model, dt=0.02, limits={"max_speed": 1.0})
 
 
 @pytest.fixture(scope="module")
@@ -170,10 +159,9 @@ def test_the_ensemble_judges_what_is_verified(refined):
         assert any("max_speed" in mark for mark in entry["marks"]) == ("model" not in entry)
 
 
-def test_a_resumed_run_trains_and_simulates_nothing_again(refined, scene, monkeypatch):
+def test_a_resumed_run_trains_and_simulates_nothing_again(refined, scene, monkeypatch, no_report):
     out, settings, before = refined.out, refined.settings, refined.summary
     monkeypatch.setattr(lessons, "launch", lambda *a, **k: pytest.fail("trained again"))
-    monkeypatch.setattr("design.report.write_report", lambda folder: None)
 
     def written():
         return {p.name: p.stat().st_mtime_ns for p in (out / "rollouts").iterdir()}

@@ -5,7 +5,6 @@ import json
 
 import numpy as np
 import pytest
-import torch
 
 from design import run as run_module
 from design.evaluators import InWorkers, SimulatorSpec
@@ -15,48 +14,24 @@ from design.settings import SettingError, Settings
 from design.trials import StudyError
 from gns_env.layout import LayoutSpace
 from gns_model.errors import LayoutError, SimulatorError
-from gns_model.learned import LearnedModel, ModelConfig, save_model
 from gns_model.measures import UNITS
 from gns_model.scene import Scene
 from gns_model.trajectory import Trajectory
 
-COARSE = SimulatorSpec("mpm", options=(("spacing", 0.0625),))
+from .short_runs import COARSE, short_flume, tiny_model
+
 FINER = SimulatorSpec("mpm", options=(("spacing", 0.05),))
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    """A short flume of some hundred coarse points with two baffles."""
-    return Scene.from_dict(
-        {
-            "name": "short",
-            "duration": 0.3,
-            "section": 0.8,
-            "domain": {"lower": [0.1, 0.1, 0.1], "upper": [1.5, 0.9, 1.1]},
-            "release": [
-                {"lower": [0.1, 0.1, 0.3], "upper": [0.45, 0.35, 0.9], "velocity": [2, 0, 0]}
-            ],
-            "baffle": [
-                {"center": [0.9, 0.3], "size": [0.15, 0.3, 0.15]},
-                {"center": [0.9, 0.9], "size": [0.15, 0.3, 0.15]},
-            ],
-            "placement": {"lower": [0.55, 0.1], "upper": [1.3, 1.1], "gap": 0.1},
-        }
-    )
+    return short_flume()
 
 
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory):
     """A tiny learned simulator that has learnt nothing."""
-    torch.manual_seed(0)
-    config = ModelConfig(spacing=0.0625, radius=0.1, latent=8, blocks=1, dt=0.025)
-    return save_model(tmp_path_factory.mktemp("model") / "tiny", LearnedModel(config))
-
-
-@pytest.fixture
-def no_report(monkeypatch):
-    """Leave out the pictures, which take most of the time of so short a run; `done` draws them."""
-    monkeypatch.setattr("design.report.write_report", lambda folder: None)
+    return tiny_model(tmp_path_factory.mktemp("model") / "tiny")
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from design.evaluators import InProcess, SimulatorSpec, run
+from design.evaluators import InProcess, run
 from design.gradient import differentiate_flows
 from design.risk import Flow, Risk, RiskError, weigh
 from design.run import optimise
@@ -19,11 +19,10 @@ from gns_env.objective import Objective
 from gns_env.task import BaffleTask
 from gns_model.errors import GnsError
 from gns_model.learned.config import Limits
-from gns_model.scene import Scene
 
 from .search_kit import FormulaSimulator, campaign, formula_scene
+from .short_runs import COARSE, baffle_at, short_flume
 
-COARSE = SimulatorSpec("mpm", options=(("spacing", 0.0625),))
 COSTS = st.lists(st.floats(0, 10), min_size=1, max_size=12)
 
 
@@ -184,27 +183,15 @@ def test_a_search_pays_for_every_flow(tasks, tmp_path, method):
 
 @pytest.fixture(scope="module")
 def small():
-    """A short flume of some hundred coarse points with two baffles."""
-    return Scene.from_dict(
-        {
-            "name": "short",
-            "duration": 0.25,
-            "section": 0.8,
-            "domain": {"lower": [0.1, 0.1, 0.1], "upper": [1.5, 0.9, 1.1]},
-            "release": [
-                {"lower": [0.1, 0.1, 0.3], "upper": [0.45, 0.35, 0.9], "velocity": [2, 0, 0]}
-            ],
-            "baffle": [
-                {"center": [0.7, 0.5], "size": [0.15, 0.3, 0.15]},
-                {"center": [0.9, 0.9], "size": [0.15, 0.3, 0.15]},
-            ],
-            "placement": {"lower": [0.46, 0.1], "upper": [1.3, 1.1], "gap": 0.1},
-        }
+    """The short flume with baffles out of line, one of them in the flow."""
+    return short_flume(
+        duration=0.25,
+        baffle=[baffle_at(0.7, 0.5), baffle_at(0.9, 0.9)],
+        placement={"lower": [0.46, 0.1], "upper": [1.3, 1.1], "gap": 0.1},
     )
 
 
-def test_a_robust_run_judges_every_flow_and_resumes(small, tmp_path, monkeypatch):
-    monkeypatch.setattr("design.report.write_report", lambda folder: None)
+def test_a_robust_run_judges_every_flow_and_resumes(small, tmp_path, no_report):
     out = tmp_path / "run"
     values = {"method": "rows", "verify": 1, "simulator": COARSE, "verifier": COARSE, "workers": 1,
               "scenarios": Scenarios(count=2, volume=(0.8, 1.3))}  # fmt: skip
@@ -239,9 +226,8 @@ def test_a_robust_run_judges_every_flow_and_resumes(small, tmp_path, monkeypatch
 
 
 def test_an_own_layout_that_a_larger_release_reaches_is_left_out_and_said(
-    small, tmp_path, monkeypatch
+    small, tmp_path, no_report
 ):
-    monkeypatch.setattr("design.report.write_report", lambda folder: None)
     close = small.with_baffles([[0.54, 0.5], [0.9, 0.9]])
     settings = Settings(method="rows", budget=2, verify=0, simulator=COARSE, workers=1,
                         scenarios=Scenarios(count=2, volume=(1.2, 1.6)))  # fmt: skip

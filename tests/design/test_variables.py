@@ -6,7 +6,6 @@ import json
 import numpy as np
 import pytest
 
-from design.evaluators import SimulatorSpec
 from design.results import RunResults
 from design.run import optimise
 from design.settings import Settings
@@ -14,9 +13,8 @@ from design.trials import StudyError
 from gns_model.errors import GnsError
 from gns_model.scene import Scene
 
+from .short_runs import COARSE
 from .test_cli import refused
-
-COARSE = SimulatorSpec("mpm", options=(("spacing", 0.0625),))
 
 
 @pytest.fixture
