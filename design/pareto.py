@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from design.trials import Trial
+from design.outcome import Trial
 
 
 def front(trials: Sequence[Trial]) -> list[Trial]:
@@ -57,19 +57,3 @@ def staircase(points: np.ndarray) -> np.ndarray:
     for before, after in pairwise(points):
         corners += [np.array([after[0], before[1]]), after]
     return np.array(corners)
-
-
-def hypervolume(costs: np.ndarray, corner: Sequence[float]) -> float:
-    """Area that a front of two objectives dominates below `corner`; costs (n, 2).
-
-    The larger the better; it grows whenever a point is added that no other beats.
-    """
-    right, ceiling = map(float, corner)
-    inside = np.asarray(costs, dtype=float).reshape(-1, 2)
-    inside = inside[(inside < (right, ceiling)).all(axis=1)]
-    area = 0.0
-    for first, second in inside[np.lexsort(inside.T[::-1])]:
-        if second < ceiling:
-            area += (right - first) * (ceiling - second)
-            ceiling = float(second)
-    return float(area)

@@ -123,8 +123,6 @@ DARK = Theme(
     origins=("#a59e92", "#6aaef0", "#f0935a", "#e07cc6", "#a9cf5e", "#5cc7dc"),
 )
 
-THEMES = (LIGHT, DARK)
-
 
 def layout_colour(theme: Theme, key: str) -> str:
     """The colour of a layout, the same in every figure; ranks after the first share one."""

@@ -18,7 +18,6 @@ from gns_env.errors import EnvError
 from gns_env.layout import LayoutSpace
 
 Placement = Literal["sequential", "joint"]
-Kind = Literal["continuous", "grid"]
 #: A continuous action counts as this far outside at most, so that `moved` stays finite.
 FAR = 100.0
 

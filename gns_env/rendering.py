@@ -44,25 +44,6 @@ WIDTH, VIEW, LEFT, TOP, BOTTOM, BETWEEN, DPI = 6.4, 4.9, 0.62, 0.42, 0.5, 0.22, 
 SHORTEST, TALLEST = 0.6, 6.0
 
 
-def plan_view(axes: Axes, trajectory: Trajectory, frame: int = -1) -> PlanView:
-    """Draw depth, baffles and control section in plan, x to the right and z up (3D scenes)."""
-    view = PlanView(axes, trajectory)
-    view.show(frame)
-    return view
-
-
-def side_view(axes: Axes, trajectory: Trajectory, frame: int = -1) -> SideView:
-    """Draw grains by speed, baffles and control section from the side, x to the right and y up."""
-    view = SideView(axes, trajectory)
-    view.show(frame)
-    return view
-
-
-def frame_image(trajectory: Trajectory, frame: int = -1) -> NDArray[np.uint8]:
-    """One frame as RGB, shape (H, W, 3); for many frames of one trajectory keep a `Film`."""
-    return Film(trajectory).image(frame)
-
-
 def rest_image(state: Evaluation, task: BaffleTask) -> NDArray[np.uint8]:
     """Where the flow of `state` came to rest, as RGB, shape (H, W, 3), with the peak depth at every
     baffle: written on it in the plan, a line upstream of its face in the side view.

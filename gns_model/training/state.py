@@ -97,20 +97,6 @@ def read_position(path: Path) -> Position:
     return parse_state(_content(path), path)[0]
 
 
-def load_state(
-    path: Path, model: LearnedModel, average: MovingAverage, optimiser: torch.optim.AdamW
-) -> Position:
-    """Read a state into `model`, `average` and `optimiser`.
-
-    Raises:
-        FileFormatError: if the file is truncated, foreign or of a newer version, or is the state
-            of another architecture.
-    """
-    position, tensors = parse_state(_content(path), path)
-    restore(tensors, model, average, optimiser, path)
-    return position
-
-
 def parse_state(content: bytes, path: Path) -> tuple[Position, dict[str, Tensor]]:
     """Position and tensors of a state file; `path` is for messages.
 

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from gns_env.deposit import depth_map
-from gns_env.rendering import BAFFLE, Film, frame_image, plan_view, rest_image, side_view
+from gns_env.rendering import BAFFLE, Film, PlanView, SideView, rest_image
 from gns_env.task import BaffleTask, simulate
 from gns_model.measures import upstream_depth_over_time
 from gns_model.mpm import MpmSimulator
@@ -52,7 +52,7 @@ def test_images_are_fresh_and_show_the_flow_and_the_baffle(spatial: Trajectory) 
     assert (first != last).any(axis=2).mean() > 0.02
     colour = np.array([int(BAFFLE[k : k + 2], 16) for k in (1, 3, 5)])
     assert (np.abs(first.astype(int) - colour).max(axis=2) < 4).sum() > 200
-    np.testing.assert_array_equal(frame_image(spatial, 0), first)
+    np.testing.assert_array_equal(Film(spatial).image(0), first)
 
 
 def test_the_deposit_is_drawn_with_the_peak_depth_at_every_baffle(small_flume: Scene) -> None:
@@ -84,16 +84,18 @@ def test_the_deposit_is_drawn_with_the_peak_depth_at_every_baffle(small_flume: S
 
 
 def test_a_plane_scene_has_a_side_view_alone(plane: Trajectory) -> None:
-    image = frame_image(plane)
+    image = Film(plane).image(-1)
     assert image.shape[0] < image.shape[1]
     with pytest.raises(ValueError, match="no plan"):
-        plan_view(Figure().add_subplot(), plane)
+        PlanView(Figure().add_subplot(), plane)
 
 
 def test_views_can_be_drawn_into_any_axes(spatial: Trajectory) -> None:
     figure = Figure()
     above, below = figure.subplots(2)
-    plan, side = plan_view(above, spatial, 3), side_view(below, spatial, 3)
+    plan, side = PlanView(above, spatial), SideView(below, spatial)
+    plan.show(3)
+    side.show(3)
     assert above.get_xlabel() == "x [m]"
     assert above.get_ylabel() == "z [m]"
     assert below.get_ylabel() == "y [m]"
@@ -105,5 +107,6 @@ def test_views_can_be_drawn_into_any_axes(spatial: Trajectory) -> None:
 
 
 def test_speed_is_that_of_the_points(spatial: Trajectory) -> None:
-    view = side_view(Figure().add_subplot(), spatial, 0)
+    view = SideView(Figure().add_subplot(), spatial)
+    view.show(0)
     np.testing.assert_allclose(view.points.get_array(), 1.5, rtol=0.15)

@@ -12,7 +12,7 @@ from gns_model.errors import FileFormatError
 from gns_model.learned.config import ModelConfig
 from gns_model.learned.model import LearnedModel
 from gns_model.training.schedule import MovingAverage
-from gns_model.training.state import Position, load_state, read_position, save_state
+from gns_model.training.state import Position, parse_state, read_position, restore, save_state
 from gns_model.training.statistics import Statistics
 
 STATISTICS = Statistics((1.0, 2.0, 0.0), 0.5, (0.0, 9.8, 0.0), 4.0, (15.0,) * 8)
@@ -29,6 +29,13 @@ def parts(latent=8, seed=0, steps=0):
         optimiser.step()
         average.update(model, k)
     return model, average, optimiser
+
+
+def load_state(path, *into):
+    """Read a state into model, average and optimiser, as a run that goes on does."""
+    position, tensors = parse_state(path.read_bytes(), path)
+    restore(tensors, *into, path)
+    return position
 
 
 @pytest.fixture
