@@ -21,8 +21,8 @@ from rich.progress import Progress
 
 from design.ensemble import Ensemble, beyond_limits, relative_spread
 from design.evaluators import SimulatorSpec
+from design.outcome import Outcome
 from design.store import Pending, Rolled, RolloutStore, Watch
-from design.trials import Outcome
 from design.verify import spearman
 from design.workers import Workers
 from gns_env.objective import Objective

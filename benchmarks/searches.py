@@ -89,7 +89,7 @@ class Remembering:
     def _each(
         self, kind: str, run: Callable[..., Any], layouts: Sequence[np.ndarray]
     ) -> Iterator[tuple[int, Any]]:
-        from design.trials import Outcome
+        from design.outcome import Outcome
 
         for k, layout in enumerate(layouts):
             name = f"{kind} {np.round(layout, 6).tolist()}"

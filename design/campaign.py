@@ -11,8 +11,9 @@ from typing import Protocol
 import numpy as np
 import optuna
 
+from design.outcome import Outcome, Trial
 from design.space import Space
-from design.trials import Outcome, Proposal, Trial, TrialLog
+from design.trials import Proposal, TrialLog
 
 #: How often a worker without budget looks whether the others have ended [s].
 LOOK = 1.0

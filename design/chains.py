@@ -11,8 +11,8 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 
+from design.outcome import Outcome
 from design.space import Space
-from design.trials import Outcome
 from gns_model.trajectory import OK
 
 #: First step of a chain [m], a third of the paper's baffle: the most that a coordinate moves.

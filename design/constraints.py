@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from design.outcome import Outcome
 from design.rules import Rules
-from design.trials import Outcome
 from design.verify import Judged
 from gns_model.polygon import clearance
 from gns_model.scene import TOLERANCE, Scene

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from design.evaluators import SimulatorSpec
+from design.outcome import Outcome
 from design.rules import broken
 from design.store import Pending, Rolled, Watch
-from design.trials import Outcome
 from design.verify import Judged
 from design.wording import count, quantities
 from gns_model.errors import SimulatorError

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
+from design.outcome import Outcome
 from design.risk import MEAN, Flow, Risk, weigh
 from design.rules import FREE, Rules
 from design.space import Space, design_space, split, varies
-from design.trials import Outcome
 from design.workers import Workers, as_completed
 from gns_env.objective import Objective
 from gns_env.task import BaffleTask, simulate

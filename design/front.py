@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from design.outcome import Trial
 from design.space import Space, described, form_of
-from design.trials import Trial
 from design.verify import Judged
 from gns_env.objective import Objective
 from gns_model.scene import Scene, write_whole

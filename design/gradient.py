@@ -21,10 +21,10 @@ from design.baselines import engineering_layouts, random_layouts
 from design.campaign import Campaign
 from design.chains import LEAST_STEP, STEP, Adam, Chain, Lbfgs
 from design.distinct import apart
+from design.outcome import Outcome
 from design.risk import Flow, Risk, weigh
 from design.rules import FREE, PENALTY, Rules
 from design.space import FORM, DesignSpace, Space, built, split
-from design.trials import Outcome
 from gns_env.task import BaffleTask
 from gns_model import measures as hard
 from gns_model.errors import SimulatorError

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from design.evaluators import failure_cost
+from design.outcome import Outcome
 from design.risk import Flow, weigh
 from design.rows import RowSpace
 from design.rules import Rules
@@ -18,7 +19,6 @@ from design.scenarios import scenes, widest
 from design.settings import Settings
 from design.space import DesignSpace, Space, built, design_space
 from design.store import Rolled
-from design.trials import Outcome
 from design.verify import Judged
 from gns_env.scenario import Scenario
 from gns_model.particles import fill

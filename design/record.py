@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 from design.constraints import constraints, to_blame
 from design.front import front_entries, relative
+from design.outcome import Trial
 from design.pareto import front
 from design.settings import Settings
 from design.storage import public
 from design.summary import results, versions
-from design.trials import Trial
 from design.verify import Judged
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from typing import Literal
 
 import numpy as np
 
+from design.outcome import Outcome
 from design.rules import Rules
-from design.trials import Outcome
 from gns_env.objective import Objective
 from gns_model.errors import GnsError
 

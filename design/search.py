@@ -23,11 +23,12 @@ from design.campaign import Campaign
 from design.evaluators import InProcess, differentiable
 from design.gradient import cost_and_gradient
 from design.methods import METHODS, choose
+from design.outcome import Trial
 from design.pareto import front
 from design.rows import RowSpace
 from design.rules import Rules
 from design.settings import SettingError, check_pattern
-from design.trials import Trial, TrialLog
+from design.trials import TrialLog
 from gns_env.task import BaffleTask
 
 __all__ = ["Result", "cost_and_gradient", "optimize"]

@@ -15,12 +15,13 @@ from design.distinct import among
 from design.ensemble import POOL, Panel, beyond_limits
 from design.evaluators import InProcess, InWorkers, TaskSpec
 from design.methods import METHODS
+from design.outcome import Trial
 from design.pareto import front, spread
 from design.references import References, take_in
 from design.space import form_of
 from design.store import Rolled, RolloutStore, Watch
 from design.summary import PARTIAL
-from design.trials import Trial, worker
+from design.trials import worker
 from design.verify import Judged, as_judged, rank
 from design.verify import candidates as best_of
 from design.workers import Workers

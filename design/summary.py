@@ -10,8 +10,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from design.outcome import Trial
 from design.space import Space, built
-from design.trials import Trial, TrialLog, table
+from design.table import table
+from design.trials import TrialLog
 from design.verify import Judged, gap, verdict
 from gns_env.objective import Objective
 from gns_model.scene import Scene, write_whole

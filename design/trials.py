@@ -8,14 +8,12 @@ looked at with Optuna's own tools, whichever method made the trials.
 from __future__ import annotations
 
 import contextlib
-import csv
-import io
 import json
 import os
 import socket
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,81 +23,12 @@ from optuna.trial import FrozenTrial, TrialState
 from design import ledger
 from design.distinct import distance
 from design.heart import Heart
+from design.outcome import Outcome, Trial, as_record, from_record
 from design.parameters import distributions, ordered, plan_dim, to_centres, to_parameters
-from design.rules import PENALTY, broken
-from design.space import FORM, DesignSpace, Space
+from design.space import Space
 from design.storage import StudyError, open_storage, public, storage_errors
 
 optuna.logging.set_verbosity(optuna.logging.ERROR)
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What running one layout gave.
-
-    Attributes:
-        cost: the objective, relative to no baffles [-]; a finite penalty if the rollout failed.
-        measures: hard measures, `gns_model.measures.summary`; empty if the rollout failed.
-        status: "ok" or how the rollout failed.
-        rollouts: forward rollouts spent.
-        backwards: backward passes through a rollout spent.
-        seconds: spent on it.
-        gradient: d(smooth cost)/d(centres) [1/m], shape (n, D-1), if it was asked for.
-        costs: one cost for each objective, of a search with several; `cost` is their sum.
-        flows: the cost in each scenario, of a robust search; `cost` is their mean or CVaR then.
-        excess: by how much each limit on the flow is broken; 0 or less where it is kept.
-    """
-
-    cost: float
-    measures: dict[str, float]
-    status: str = "ok"
-    rollouts: int = 1
-    backwards: int = 0
-    seconds: float = 0.0
-    gradient: np.ndarray | None = None
-    costs: tuple[float, ...] = ()
-    flows: tuple[float, ...] = ()
-    excess: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def feasible(self) -> bool:
-        """Whether the rollout reached its end and every limit is kept."""
-        return self.status == "ok" and broken(self.excess) == 0
-
-    @property
-    def order(self) -> tuple[float, float]:
-        """What layouts are ranked by, least first: what is broken of the limits, then the cost."""
-        return broken(self.excess), self.cost
-
-    @property
-    def merit(self) -> float:
-        """The cost, and a penalty for what is broken of the limits: what a gradient makes small."""
-        return self.cost + PENALTY * broken(self.excess)
-
-
-@dataclass(frozen=True)
-class Trial:
-    """One layout that was tried: `centres` [m], shape (n, D-1), where it came from, its outcome."""
-
-    number: int
-    origin: str
-    centres: np.ndarray
-    outcome: Outcome
-
-    @property
-    def cost(self) -> float:
-        """The objective, relative to no baffles [-]."""
-        return self.outcome.cost
-
-    @property
-    def ok(self) -> bool:
-        """Whether the rollout reached its end."""
-        return self.outcome.status == "ok"
-
-    @property
-    def order(self) -> tuple[float, float]:
-        """See `Outcome.order`."""
-        return self.outcome.order
 
 
 @dataclass(frozen=True)
@@ -278,7 +207,7 @@ class TrialLog:
         If this worker counted as dead meanwhile, the layout is another's to tell.
         """
         trial_id = self._asked[proposal.number]
-        record = _record(proposal.origin, proposal.centres, outcome)
+        record = as_record(proposal.origin, proposal.centres, outcome) | {"worker": worker()}
         with contextlib.suppress(optuna.exceptions.UpdateFinishedTrialError):
             self.study._storage.set_trial_user_attr(trial_id, ledger.RECORD, record)
             if outcome.excess:
@@ -336,7 +265,8 @@ class TrialLog:
     def trials(self) -> list[Trial]:
         """Everything that was tried, in the order it was asked for."""
         finished = self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-        return [trial for trial in map(_trial, finished) if trial is not None]
+        records = ((t.number, t.user_attrs.get(ledger.RECORD)) for t in finished)
+        return [from_record(number, record) for number, record in records if record is not None]
 
     def best(self) -> Trial | None:
         """The trial of least cost among those whose rollout reached its end, and kept the limits if
@@ -431,89 +361,9 @@ class TrialLog:
             self._create(TrialState.WAITING, centres, attributes)
 
 
-def table(trials: Sequence[Trial], space: Space | None = None) -> str:
-    """Trials as CSV text with a header; `space` says what varies beside the places."""
-    measures = list(dict.fromkeys(name for t in trials for name in t.outcome.measures))
-    axes = ("x", "z")
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    varied = space.names if isinstance(space, DesignSpace) else ()
-    plan = trials[0].centres.shape[1] - len(varied) if trials else 0
-    most = max((len(t.centres) for t in trials), default=0)
-    columns = [f"{axes[j]}{k + 1}" for k in range(most) for j in range(plan)]
-    limits = list(trials[0].outcome.excess) if trials else []
-    spent = ["rollouts", "backwards", "seconds"]
-    parts = [
-        *(f"cost_{k + 1}" for k in range(max((len(t.outcome.costs) for t in trials), default=0))),
-        *(f"flow_{k + 1}" for k in range(max((len(t.outcome.flows) for t in trials), default=0))),
-    ]
-    broken_by = [f"excess_{name}" for name in limits]
-    writer.writerow(
-        ["number", "origin", "status", "cost", *parts, *measures, *broken_by]
-        + [*varied, *columns, *spent]
-    )
-    for t in trials:
-        o = t.outcome
-        writer.writerow(
-            [t.number, t.origin, o.status, repr(float(o.cost))]
-            + [repr(float(c)) for c in (*o.costs, *o.flows)]
-            + [repr(float(o.measures[m])) if m in o.measures else "" for m in measures]
-            + [f"{o.excess.get(name, 0.0):.6f}" for name in limits]
-            + [f"{value:.6f}" for value in _form_of(space, t.centres).values()]
-            + [f"{c:.6f}" for c in t.centres[:, :plan].ravel()]
-            + [""] * ((most - len(t.centres)) * plan)
-            + [o.rollouts, o.backwards, f"{o.seconds:.3f}"]
-        )
-    return text.getvalue()
-
-
-def _form_of(space: Space | None, layout: np.ndarray) -> dict[str, float]:
-    """What varies of the form of a layout, by name: sizes [m], yaw [degrees]."""
-    if not isinstance(space, DesignSpace):
-        return {}
-    _, form = space.split(layout)
-    known = {"yaw": form.yaw, **dict(zip(FORM, form.size, strict=False))}
-    return {name: known[name] for name in space.names}
-
-
 def worker() -> str:
     """The name of this process among the workers of a study."""
     return f"{socket.gethostname()}-{os.getpid()}"
-
-
-def _record(origin: str, centres: np.ndarray, outcome: Outcome) -> dict[str, Any]:
-    return {
-        "origin": origin,
-        "centres": np.asarray(centres).tolist(),
-        "cost": outcome.cost,
-        "measures": outcome.measures,
-        "status": outcome.status,
-        "rollouts": outcome.rollouts,
-        "backwards": outcome.backwards,
-        "seconds": outcome.seconds,
-        "costs": list(outcome.costs),
-        "flows": list(outcome.flows),
-        "excess": outcome.excess,
-        "worker": worker(),
-    }
-
-
-def _trial(frozen: FrozenTrial) -> Trial | None:
-    record = frozen.user_attrs.get("record")
-    if record is None:
-        return None
-    outcome = Outcome(
-        cost=float(record["cost"]),
-        measures=dict(record["measures"]),
-        status=str(record["status"]),
-        rollouts=int(record["rollouts"]),
-        backwards=int(record["backwards"]),
-        seconds=float(record["seconds"]),
-        costs=tuple(map(float, record.get("costs", ()))),
-        flows=tuple(map(float, record.get("flows", ()))),
-        excess={name: float(value) for name, value in record.get("excess", {}).items()},
-    )
-    return Trial(frozen.number, str(record["origin"]), np.array(record["centres"]), outcome)
 
 
 def _same_task(known: dict[str, Any], asked: dict[str, Any], option: str) -> None:

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from design.ensemble import Ensemble, Panel, beyond_limits, relative_spread
 from design.evaluators import SimulatorSpec
+from design.outcome import Outcome
 from design.store import Rolled
-from design.trials import Outcome
 from design.verify import Judged
 from gns_model.scene import Scene
 

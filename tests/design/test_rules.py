@@ -10,10 +10,11 @@ import design
 from design.constraints import constraints, to_blame
 from design.evaluators import InProcess, space_of
 from design.gradient import differentiate_flows
+from design.outcome import Outcome, Trial
 from design.risk import Risk
 from design.rules import PENALTY, RuleError, Rules
 from design.space import built
-from design.trials import Outcome, Trial, table
+from design.table import table
 from design.verify import Judged, as_judged, rank, verdict
 from gns_env.objective import Objective
 from gns_env.task import BaffleTask

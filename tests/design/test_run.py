@@ -11,7 +11,7 @@ from design.evaluators import InWorkers, SimulatorSpec
 from design.measure import measure
 from design.run import optimise
 from design.settings import SettingError, Settings
-from design.trials import StudyError
+from design.storage import StudyError
 from gns_env.layout import LayoutSpace
 from gns_model.errors import LayoutError, SimulatorError
 from gns_model.measures import UNITS

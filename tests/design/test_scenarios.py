@@ -14,7 +14,7 @@ from design.risk import Flow, Risk, RiskError, weigh
 from design.run import optimise
 from design.scenarios import ScenarioError, Scenarios, parse_range, scenarios_of, scenes, widest
 from design.settings import SettingError, Settings
-from design.trials import StudyError
+from design.storage import StudyError
 from gns_env.objective import Objective
 from gns_env.task import BaffleTask
 from gns_model.errors import GnsError

@@ -11,7 +11,10 @@ from design.chains import LEAST_STEP, STEP, Adam, Lbfgs
 from design.distinct import distance
 from design.gradient import differentiate
 from design.methods import FOLLOW, METHODS
-from design.trials import Outcome, StudyError, TrialLog, table
+from design.outcome import Outcome
+from design.storage import StudyError
+from design.table import table
+from design.trials import TrialLog
 from gns_env.layout import LayoutSpace
 from gns_env.objective import Objective
 from gns_env.task import BaffleTask

@@ -9,7 +9,7 @@ import pytest
 from design.results import RunResults
 from design.run import optimise
 from design.settings import Settings
-from design.trials import StudyError
+from design.storage import StudyError
 from gns_model.errors import GnsError
 from gns_model.scene import Scene
 

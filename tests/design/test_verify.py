@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from design.outcome import Outcome, Trial
 from design.risk import Flow, Risk, weigh
-from design.trials import Outcome, Trial
 from design.verify import Judged, candidates, gap, rank, spearman, verdict
 from gns_env.objective import Objective
 
