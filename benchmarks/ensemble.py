@@ -28,8 +28,9 @@ from design.workers import Workers
 from gns_env.objective import Objective
 from gns_model import measures
 from gns_model.console import print_table, progress_bar
+from gns_model.files import write_whole
 from gns_model.learned.checkpoint import CARD, read_card
-from gns_model.scene import Scene, write_whole
+from gns_model.scene import Scene
 from gns_model.trajectory import Trajectory
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])

@@ -134,7 +134,8 @@ def run_all(arguments: argparse.Namespace, scene: str, seed: int) -> list[str]:
     from design.methods import METHODS as SEARCHES
     from design.trials import TrialLog
     from gns_env.task import BaffleTask
-    from gns_model.scene import Scene, write_whole
+    from gns_model.files import write_whole
+    from gns_model.scene import Scene
     from gns_model.simulator import load_simulator
 
     torch.set_num_threads(1)
@@ -177,7 +178,7 @@ def run_all(arguments: argparse.Namespace, scene: str, seed: int) -> list[str]:
 
 def same_settings(arguments: argparse.Namespace) -> None:
     """Write down what the runs in --out have in common, or refuse to add others to them."""
-    from gns_model.scene import write_whole
+    from gns_model.files import write_whole
 
     names = ("budget", "batch", "duration", "simulator", "precision")
     settings = {name: getattr(arguments, name) for name in names}
@@ -334,7 +335,7 @@ def main() -> None:
     rows = gather(arguments.out)
     if not rows:
         sys.exit(f"no run in {arguments.out} has ended")
-    from gns_model.scene import write_whole
+    from gns_model.files import write_whole
 
     text = io.StringIO()
     writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")

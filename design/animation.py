@@ -19,7 +19,7 @@ from design import views, wording
 from design.flow_figures import Shown, shown_flows
 from design.results import Design, RunResults
 from design.theme import DARK, Theme, layout_colour
-from gns_model.scene import write_whole
+from gns_model.files import write_whole
 from gns_model.trajectory import Trajectory
 
 #: Frames of the loop, and how long each is shown and the last one is held [ms].

@@ -12,8 +12,9 @@ import numpy as np
 from design.outcome import Outcome
 from design.rules import Rules
 from design.verify import Judged
+from gns_model.parts import TOLERANCE
 from gns_model.polygon import clearance
-from gns_model.scene import TOLERANCE, Scene
+from gns_model.scene import Scene
 
 #: Limit on the flow -> what a reader calls it.
 WORDS = {

@@ -21,7 +21,7 @@ from design.front_figures import front
 from design.results import RunResults
 from design.search_figures import history, trade_off
 from design.theme import DARK, LIGHT, Theme
-from gns_model.scene import write_whole
+from gns_model.files import write_whole
 
 #: Sharp on a page about 1080 CSS pixels wide, also on a dense screen.
 DPI = 170

@@ -12,7 +12,8 @@ from design.outcome import Trial
 from design.space import Space, described, form_of
 from design.verify import Judged
 from gns_env.objective import Objective
-from gns_model.scene import Scene, write_whole
+from gns_model.files import write_whole
+from gns_model.scene import Scene
 
 
 def front_entries(

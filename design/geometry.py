@@ -23,7 +23,8 @@ import numpy as np
 import trimesh
 from trimesh.visual.material import PBRMaterial
 
-from gns_model.scene import Scene, write_whole
+from gns_model.files import write_whole
+from gns_model.scene import Scene
 
 #: Scene frame (y up) -> STL frame (z up): a rotation about x, as a 4 x 4 matrix.
 Y_UP_TO_Z_UP = np.array(

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import shutil
 import time
 from collections.abc import Sequence
@@ -23,6 +22,7 @@ from design.evaluators import SimulatorSpec
 from design.store import RolloutStore, Watch
 from design.verify import Judged
 from gns_model.errors import FileFormatError
+from gns_model.files import link_or_copy
 from gns_model.learned.checkpoint import CARD, load_model, read_card, save_model
 from gns_model.learned.config import Limits
 from gns_model.scene import Scene
@@ -180,10 +180,7 @@ def _lay_out(run: Run, lesson: Lesson, store: RolloutStore, watch: Watch) -> lis
         if rolled.status != "ok":
             continue
         link = folder / f"verified-{k:03d}.h5"
-        try:
-            os.link(rolled.path, link)
-        except OSError:  # a file system without hard links
-            shutil.copyfile(rolled.path, link)
+        link_or_copy(rolled.path, link)
         with open_trajectory(link) as file:
             scenes.append(Scene.from_dict(json.loads(file.attrs["scene"]), source=str(link)))
     return scenes

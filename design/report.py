@@ -18,7 +18,7 @@ from design.figures import write_figures
 from design.front_page import pareto, scenarios
 from design.provenance import files, reproduce
 from design.results import RunResults
-from gns_model.scene import write_whole
+from gns_model.files import write_whole
 
 FOOTER = (
     "<footer>Baffle layout by gns-design. Axes: x downstream, y up, z across; SI units. "

@@ -24,7 +24,9 @@ from design.blame import room_for
 from gns_env.layout import LayoutSpace
 from gns_model.errors import LayoutError
 from gns_model.footprint import wrap
-from gns_model.scene import TOLERANCE, Placement, Scene, Vary
+from gns_model.parts import TOLERANCE
+from gns_model.placement import Vary
+from gns_model.scene import Placement, Scene
 
 #: Variables of a form, in the order of their columns; the sizes in the order of `Baffle.size`.
 FORM = ("along", "height", "across", "yaw")

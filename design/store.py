@@ -12,7 +12,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +22,8 @@ from design.evaluators import SimulatorSpec
 from design.workers import Job, Workers, as_completed, report
 from gns_model import measures as hard
 from gns_model.errors import GnsError
-from gns_model.scene import Scene, write_whole
+from gns_model.files import link_or_copy, write_whole
+from gns_model.scene import Scene
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -97,10 +97,7 @@ class RolloutStore:
         link.parent.mkdir(parents=True, exist_ok=True)
         temporary = link.with_name(f".{link.name}.{os.getpid()}")
         temporary.unlink(missing_ok=True)
-        try:
-            os.link(rolled.path, temporary)
-        except OSError:  # a file system without hard links
-            shutil.copyfile(rolled.path, temporary)
+        link_or_copy(rolled.path, temporary)
         os.replace(temporary, link)
 
     def prune(self, named: set[Path]) -> None:

@@ -16,7 +16,8 @@ from design.table import table
 from design.trials import TrialLog
 from design.verify import Judged, gap, verdict
 from gns_env.objective import Objective
-from gns_model.scene import Scene, write_whole
+from gns_model.files import write_whole
+from gns_model.scene import Scene
 
 #: How far a run has come: "partial" between stages, "interrupted" by Ctrl-C or an error.
 COMPLETE, PARTIAL, INTERRUPTED = "complete", "partial", "interrupted"

@@ -26,8 +26,9 @@ from gns_env.projection import Projector
 from gns_env.room import free_rectangles, nearest_free, pack
 from gns_model.errors import LayoutError
 from gns_model.footprint import bounding_size, corners
+from gns_model.parts import TOLERANCE
 from gns_model.polygon import clearance, strips
-from gns_model.scene import TOLERANCE, Box, Placement, Scene
+from gns_model.scene import Box, Placement, Scene
 
 Array = NDArray[np.float64]
 

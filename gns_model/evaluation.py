@@ -31,8 +31,9 @@ from scipy.stats import spearmanr
 
 from gns_model import measures
 from gns_model.errors import SimulatorError
+from gns_model.files import write_whole
 from gns_model.learned.adjoint import ADJOINT_LIMIT, ADJOINT_SMOOTHING
-from gns_model.scene import Scene, write_whole
+from gns_model.scene import Scene
 from gns_model.simulator import Progress, Simulator
 from gns_model.smooth_measures import TEMPERATURE, smooth_measures
 from gns_model.trajectory import OK, Trajectory

@@ -12,8 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
 from gns_model.evaluation import CELL, JUDGED, Comparison
+from gns_model.files import write_whole
 from gns_model.measures import UNITS
-from gns_model.scene import Scene, write_whole
+from gns_model.scene import Scene
 
 _TITLES = {
     "centroid_travel": "centroid travel",

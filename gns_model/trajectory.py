@@ -27,7 +27,8 @@ import h5py
 import numpy as np
 
 from gns_model.errors import FileFormatError
-from gns_model.scene import Scene, write_whole
+from gns_model.files import write_whole
+from gns_model.scene import Scene
 
 FORMAT = "gns-trajectory"
 VERSION = 1

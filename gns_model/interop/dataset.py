@@ -19,11 +19,11 @@ import h5py
 import numpy as np
 
 from gns_model.errors import FileFormatError
+from gns_model.files import write_whole
 from gns_model.interop.arrays import count_npz, read_npz
 from gns_model.interop.metadata import Metadata, Section, checked
 from gns_model.interop.releases import point_spacing, scene_of
 from gns_model.particles import STATIONARY
-from gns_model.scene import write_whole
 from gns_model.trajectory import Trajectory
 
 #: Positions this part of the longest edge outside of the bounds are not of that domain: noise and

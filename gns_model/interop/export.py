@@ -17,11 +17,11 @@ import numpy as np
 import torch
 
 from gns_model.errors import FileFormatError
+from gns_model.files import write_whole
 from gns_model.interop.metadata import Metadata, read_json
 from gns_model.learned.config import ModelConfig
 from gns_model.learned.world import baffle_points, baffle_poses
 from gns_model.particles import STATIONARY
-from gns_model.scene import write_whole
 from gns_model.trajectory import Trajectory, open_trajectory
 
 Progress = Callable[[int, int], None]

@@ -14,9 +14,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from gns_model.errors import FileFormatError
+from gns_model.errors import FileFormatError, first_fault
 from gns_model.learned.config import ModelConfig
-from gns_model.scene import first_fault
 
 Section = Literal["train", "rollout"]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]

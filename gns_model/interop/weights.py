@@ -28,12 +28,11 @@ import torch
 from pydantic import ValidationError
 from torch import Tensor
 
-from gns_model.errors import FileFormatError
+from gns_model.errors import FileFormatError, first_fault
 from gns_model.interop.metadata import Metadata
 from gns_model.learned.config import Limits, ModelConfig
 from gns_model.learned.model import LearnedModel
 from gns_model.particles import STATIONARY
-from gns_model.scene import first_fault
 
 EdgeUpdate = Literal["residual", "doubled"]
 State = dict[str, Tensor]

@@ -166,7 +166,7 @@ def _on_data(
     quiet: bool,
 ) -> None:
     from gns_model.evaluation import compare, gradient_check
-    from gns_model.scene import write_whole
+    from gns_model.files import write_whole
     from gns_model.simulator import load_simulator
     from gns_model.trajectory import Trajectory
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gns_model.errors import GnsError, SimulatorError
-from gns_model.scene import write_whole
+from gns_model.files import write_whole
 from gns_model.simulator import Simulator
 from gns_model.suites import columns, flume, friction, speed, training, upscaled
 from gns_model.suites.result import SuiteResult, finite

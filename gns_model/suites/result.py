@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gns_model.scene import write_whole
+from gns_model.files import write_whole
 
 #: A row of a table: names of its columns and plain values.
 Row = dict[str, Any]

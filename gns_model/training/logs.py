@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from gns_model.scene import write_whole
+from gns_model.files import write_whole
 
 
 class Table:

@@ -10,9 +10,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from gns_model.files import write_whole
 from gns_model.learned.checkpoint import save_model
 from gns_model.learned.model import LearnedModel
-from gns_model.scene import write_whole
 from gns_model.training import batches
 from gns_model.training.claim import TrainingError, claim, tidy
 from gns_model.training.distributed import RankError, Ranks, session

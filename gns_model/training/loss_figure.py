@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gns_model.scene import write_whole
+from gns_model.files import write_whole
 from gns_model.training.logs import read_table
 
 LOG, VALIDATION, PLOT = "log.csv", "validation.csv", "loss.png"

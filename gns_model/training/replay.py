@@ -28,7 +28,7 @@ from safetensors.numpy import load, save
 from torch import Tensor
 
 from gns_model.data.windows import Window, WindowIndex
-from gns_model.scene import write_whole
+from gns_model.files import write_whole
 from gns_model.training import batches
 from gns_model.training.batches import Batch, Draw
 from gns_model.training.distributed import Ranks

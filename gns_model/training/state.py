@@ -19,8 +19,8 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from gns_model.errors import FileFormatError
+from gns_model.files import write_whole
 from gns_model.learned.model import LearnedModel
-from gns_model.scene import write_whole
 from gns_model.training.schedule import MovingAverage
 from gns_model.training.statistics import Statistics
 

@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gns_model.errors import GnsError, SceneError
-from gns_model.scene import Scene, write_whole
+from gns_model.files import write_whole
+from gns_model.scene import Scene
 
 
 def plain(**changes: object) -> dict:
