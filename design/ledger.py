@@ -17,11 +17,13 @@ from optuna.trial import FrozenTrial, TrialState
 
 #: User attributes of a trial. ORIGIN: where a layout that was given came from; PASSES: what running
 #: it costs; WORKER: who runs it; LOST: its worker left before it was told; RETRY_OF: number of the
-#: lost trial of this layout; RETRIES: how often it was tried again; DROPPED: asked for by two, or
-#: beyond the budget; RECORD: what it gave.
+#: lost trial of this layout; RETRIES: how often it was tried again; DROPPED: why it is not run, TWIN or
+#: SURPLUS; RECORD: what it gave.
 ORIGIN, PASSES, WORKER, LOST, RETRY_OF, RETRIES, DROPPED, RECORD = (
     "origin", "passes", "worker", "lost", "retry_of", "retries", "dropped", "record",
 )  # fmt: skip
+#: Asked for by another too; beyond the budget.
+TWIN, SURPLUS = "twin", "surplus"
 #: A layout that took its worker down so often is given up.
 MOST_RETRIES = 5
 
@@ -33,7 +35,7 @@ def held(trials: Sequence[FrozenTrial], price: int) -> dict[int, int]:
     Args:
         price: of a trial that does not say: one rollout of a layout.
     """
-    tried_again = {t.number for t in lost(trials)}
+    kept = {t.number for t in owed(trials)}
     found, seen = {}, set()
     for t in sorted(trials, key=lambda t: t.number):
         attributes = t.user_attrs
@@ -48,22 +50,38 @@ def held(trials: Sequence[FrozenTrial], price: int) -> dict[int, int]:
                 found[t.number] = int(record["rollouts"]) + int(record["backwards"])
         elif t.state == TrialState.RUNNING:
             found[t.number] = int(attributes.get(PASSES, price))
-        elif (t.state == TrialState.WAITING and RETRY_OF in attributes) or t.number in tried_again:
+        elif (t.state == TrialState.WAITING and RETRY_OF in attributes) or t.number in kept:
             found[t.number] = price
     return found
 
 
-def lost(trials: Sequence[FrozenTrial]) -> list[FrozenTrial]:
-    """Failed trials whose layout is to be tried again, and waits for it in no trial yet."""
-    again = {t.user_attrs.get(RETRY_OF) for t in trials}
+def owed(trials: Sequence[FrozenTrial]) -> list[FrozenTrial]:
+    """Failed trials whose layout is not known, and that no trial is to try again yet.
+
+    A retry that was dropped since another worker ran the layout just then leaves it owed: the other
+    may be dropped in its turn.
+    """
+    settled = {
+        t.user_attrs[RETRY_OF]
+        for t in trials
+        if RETRY_OF in t.user_attrs and t.user_attrs.get(DROPPED) != TWIN
+    }
+    done = [t for t in trials if ORIGIN in t.user_attrs and t.state == TrialState.COMPLETE]
     return [
         t
         for t in trials
         if t.state == TrialState.FAIL
         and t.user_attrs.get(LOST)
-        and t.number not in again
+        and t.number not in settled
         and int(t.user_attrs.get(RETRIES, 0)) < MOST_RETRIES
+        and not any(_same_given(t, o) for o in done)
     ]
+
+
+def lost(trials: Sequence[FrozenTrial]) -> list[FrozenTrial]:
+    """Those of `owed` that nobody runs just now: to be tried again."""
+    running = [t for t in trials if ORIGIN in t.user_attrs and t.state == TrialState.RUNNING]
+    return [t for t in owed(trials) if not any(_same_given(t, o) for o in running)]
 
 
 def surplus(
@@ -71,13 +89,24 @@ def surplus(
 ) -> set[int]:
     """Which of `numbers` have no room in the budget beside the trials that were asked before."""
     holds = held(trials, price)
+    turn = _turns(trials)
     taken, beyond = 0, set()
-    for number in sorted(holds):
+    for number in sorted(holds, key=lambda number: (turn[number], number)):
         if number in numbers and taken + holds[number] > budget:
             beyond.add(number)
         else:
             taken += holds[number]
     return beyond
+
+
+def _turns(trials: Sequence[FrozenTrial]) -> dict[int, int]:
+    """Where each trial stands in the queue for the budget: where it was asked for, and a layout
+    that is tried again where it was asked for first, or trials that were asked for before its
+    worker was missed would take its room."""
+    turn: dict[int, int] = {}
+    for t in sorted(trials, key=lambda t: t.number):
+        turn[t.number] = turn.get(t.user_attrs.get(RETRY_OF, t.number), t.number)
+    return turn
 
 
 def twins(trials: Sequence[FrozenTrial], numbers: Sequence[int], since: int = 0) -> set[int]:
@@ -106,6 +135,11 @@ def _same(later: FrozenTrial, earlier: FrozenTrial, since: int) -> bool:
         return False
     old = earlier.state == TrialState.COMPLETE and earlier.number < since
     return not (ours[ORIGIN] == "gradient" and old) and _same_place(later, earlier)
+
+
+def _same_given(one: FrozenTrial, other: FrozenTrial) -> bool:
+    origins = [t.user_attrs.get(ORIGIN) for t in (one, other)]
+    return origins[0] == origins[1] is not None and _same_place(one, other)
 
 
 def _same_place(one: FrozenTrial, other: FrozenTrial) -> bool:

@@ -176,7 +176,8 @@ class TrialLog:
         dropped = twins | ledger.surplus(trials, numbers, budget, price)
         for number in dropped:
             trial_id = self._asked[number]
-            self.study._storage.set_trial_user_attr(trial_id, ledger.DROPPED, True)
+            why = ledger.TWIN if number in twins else ledger.SURPLUS
+            self.study._storage.set_trial_user_attr(trial_id, ledger.DROPPED, why)
             self._let_go(number)
         return [None if p.number in dropped else p for p in proposals]
 

@@ -22,6 +22,7 @@ from design.cli import app
 from design.evaluators import InProcess
 from design.folder import claim, release
 from design.methods import METHODS
+from design.parameters import to_centres
 from design.storage import StudyError, public, sqlite_url
 from design.trials import Outcome, TrialLog
 from gns_env.layout import LayoutSpace
@@ -92,11 +93,12 @@ def kill_within_a_trial(storage, name, pids, after=0):
     """End the first of some workers that runs trials, once so many are told: the study, the
     trials' numbers, and which worker it was."""
     address = storage.replace("postgresql:", "postgresql+psycopg:")
-    study, end = None, time.monotonic() + 300
+    study, backend, end = None, None, time.monotonic() + 300
     while time.monotonic() < end:
         time.sleep(0.05)
-        try:
-            study = study or optuna.load_study(study_name=name, storage=address)
+        try:  # one storage for all tries: each keeps its connection, and a server has so many
+            backend = backend or optuna.storages.RDBStorage(address)
+            study = study or optuna.load_study(study_name=name, storage=backend)
         except Exception:  # it is being made
             continue
         trials = study.get_trials(deepcopy=False)
@@ -158,11 +160,14 @@ def test_workers_share_a_budget_and_one_is_killed(storage, method):
     assert asked <= {t.number for t in lost}
     for t in lost:
         tried = [a for a in told if a.user_attrs.get(ledger.RETRY_OF) == t.number]
-        if not tried and method == "gradient":
-            # The others had spent the whole budget before it was missed; see README, what is
-            # missing. What it cost is spent on other layouts, so nothing but this one is lost.
-            assert spent >= budget - 1
-            continue
+        # Two workers' chains may meet: then the other's own trial of that layout is the retry.
+        tried += [
+            a
+            for a in told
+            if not tried
+            and a.user_attrs.get(ledger.ORIGIN) == t.user_attrs.get(ledger.ORIGIN) == "gradient"
+            and a.params == pytest.approx(t.params, abs=1e-6)
+        ]
         (again,) = tried
         assert again.params == pytest.approx(t.params)
         assert not again.user_attrs[ledger.RECORD]["worker"].endswith(f"-{workers[0].pid}")
@@ -178,22 +183,26 @@ def test_workers_share_a_budget_and_one_is_killed(storage, method):
 # -- the ledger ------------------------------------------------------------------------------------
 
 
-@settings(max_examples=25)
+@settings(max_examples=60)
 @given(
     steps=st.lists(
-        st.tuples(st.integers(0, 2), st.sampled_from(["ask", "rows", "steps", "tell", "die"])),
-        max_size=14,
+        st.tuples(
+            st.integers(0, 2),
+            st.sampled_from(["again", "ask", "rows", "steps", "admit", "tell", "die"]),
+        ),
+        max_size=24,
     ),
     budget=st.integers(4, 20),
 )
 def test_whoever_asks_tells_or_dies_when_the_budget_is_spent_and_no_more(steps, budget):
-    """Whatever three workers do in whatever order, those that are left spend exactly the rest."""
+    """Whatever three workers do in whatever order, those that are left spend exactly the rest, and
+    every layout that was admitted and lost is told."""
     study = optuna.create_study()
     space = LayoutSpace(formula_scene(), 1)
     rows = [("row", np.array([[0.7, z]])) for z in (0.4, 0.8, 1.2)]
     sampler = optuna.samplers.RandomSampler(seed=0)
     logs = [TrialLog(study, space) for _ in range(3)]
-    open_ = [[] for _ in logs]
+    asked, open_, mine = [[] for _ in logs], [[] for _ in logs], set()
     forward, both = Outcome(1.0, {}), Outcome(1.0, {}, backwards=1)
 
     def admitted(log, proposals):
@@ -201,22 +210,31 @@ def test_whoever_asks_tells_or_dies_when_the_budget_is_spent_and_no_more(steps, 
 
     for k, what in steps:
         log = logs[k]
-        if what == "ask":
-            open_[k] += [(p, forward) for p in admitted(log, log.again(2))]
-            open_[k] += [(p, forward) for p in admitted(log, log.ask(2, sampler, "random"))]
-        elif what == "rows":
-            open_[k] += [(p, forward) for p in admitted(log, log.reserve(rows))]
-        elif what == "steps":
-            steps_ = log.reserve([("gradient", np.array([[0.9, 0.3 + 0.2 * k]]))], 2)
-            open_[k] += [(p, both) for p in admitted(log, steps_)]
+        if what == "die":
+            log.abandon()
+            asked[k], open_[k] = [], []
         elif what == "tell":
             for proposal, outcome in open_[k]:
                 log.tell(proposal, outcome)
             open_[k] = []
-        else:
-            log.abandon()
-            open_[k] = []
-        assert log.taken(1) <= budget
+        elif what == "admit":
+            for proposals, outcome in asked[k]:
+                open_[k] += [(p, outcome) for p in admitted(log, proposals)]
+                mine |= {p.number for p, _ in open_[k]}
+            asked[k] = []
+        elif not asked[k]:  # between asking and being admitted a worker does nothing else
+            if what == "again":
+                found = log.again(2), forward
+            elif what == "ask":
+                found = log.ask(2, sampler, "random"), forward
+            elif what == "rows":
+                found = log.reserve(rows), forward
+            else:  # chains of two workers may meet
+                layouts = [("gradient", np.array([[0.9, 0.3]]))]
+                found = log.reserve(layouts, 2), both
+            asked[k].append(found)
+        running = sum(o.rollouts + o.backwards for held in open_ for _, o in held)
+        assert log.spent() + running <= budget
     for log in logs[1:]:
         log.abandon()
     rest = logs[0]
@@ -226,10 +244,17 @@ def test_whoever_asks_tells_or_dies_when_the_budget_is_spent_and_no_more(steps, 
             rest.tell(proposal, forward)
     assert rest.spent() == rest.taken(1) == budget
     frozen = study.get_trials()
-    lost = {t.number for t in frozen if ledger.LOST in t.user_attrs}
     told = [t for t in rest.trials()]
-    assert not ledger.lost(frozen)
-    assert lost <= {t.user_attrs.get(ledger.RETRY_OF) for t in frozen}
+    again = {
+        t.user_attrs.get(ledger.RETRY_OF): t for t in frozen if ledger.DROPPED not in t.user_attrs
+    }
+    for t in (frozen[n] for n in mine):
+        while t.number in again:
+            t = again[t.number]
+        given_up = t.user_attrs.get(ledger.RETRIES) == ledger.MOST_RETRIES
+        origin, layout = t.user_attrs.get(ledger.ORIGIN), to_centres(space, t.params)
+        by_other = any(a.origin == origin and np.allclose(a.centres, layout) for a in told)
+        assert t.state.name == "COMPLETE" or given_up or by_other
     places = [tuple(t.centres.ravel()) for t in told if t.origin == "row"]
     assert len(places) == len(set(places))
 
