@@ -8,8 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from design.form import described
 from design.outcome import Trial
-from design.space import Space, described, form_of
+from design.space import Space, form_of
 from design.verify import Judged
 from gns_env.objective import Objective
 from gns_model.files import write_whole

@@ -21,10 +21,11 @@ from design.baselines import engineering_layouts, random_layouts
 from design.campaign import Campaign
 from design.chains import LEAST_STEP, STEP, Adam, Chain, Lbfgs
 from design.distinct import apart
+from design.form import FORM
 from design.outcome import Outcome
 from design.risk import Flow, Risk, weigh
 from design.rules import FREE, PENALTY, Rules
-from design.space import FORM, DesignSpace, Space, built, split
+from design.space import DesignSpace, Space, built, split
 from gns_env.task import BaffleTask
 from gns_model import measures as hard
 from gns_model.errors import SimulatorError
@@ -279,7 +280,7 @@ class _Leaves:
         self.centres = torch.tensor(np.array(centres, dtype=np.float64), requires_grad=True)
         size, yaw = torch.tensor(form.size, dtype=torch.float64), torch.tensor(form.yaw)
         self._names = space.names if isinstance(space, DesignSpace) else ()
-        self._degree = space.degree if isinstance(space, DesignSpace) else 0.0
+        self._degree = space.forms.degree if isinstance(space, DesignSpace) else 0.0
         size.requires_grad_(follows and any(name != "yaw" for name in self._names))
         self.form = size, yaw.double().requires_grad_(follows and "yaw" in self._names)
 

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from design.form import Form
 from design.outcome import Outcome, Trial
-from design.space import DesignSpace, Form, numbers, split
+from design.space import DesignSpace, numbers, split
 from design.store import Pending, Rolled, RolloutStore
 from design.verify import as_judged
 from gns_model.errors import SceneError, SimulatorError

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from design.space import FORM
+from design.form import FORM
 from gns_model import measures
 from gns_model.errors import GnsError
 from gns_model.scene import Scene

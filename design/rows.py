@@ -20,7 +20,8 @@ from optuna.distributions import BaseDistribution, FloatDistribution, IntDistrib
 
 from design.baselines import row_counts, rows
 from design.distinct import distance
-from design.space import MOST_SPACES, DesignSpace, Form
+from design.form import Form
+from design.space import MOST_SPACES, DesignSpace
 from gns_env.layout import LayoutSpace
 from gns_model.errors import LayoutError
 from gns_model.scene import Scene

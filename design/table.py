@@ -8,8 +8,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from design.form import FORM
 from design.outcome import Trial
-from design.space import FORM, DesignSpace, Space
+from design.space import DesignSpace, Space
 
 
 def table(trials: Sequence[Trial], space: Space | None = None) -> str:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from design.form import FORM
 from design.settings import SettingError
-from design.space import FORM
 
 
 def placement_of(vary: Sequence[str], number: str | None, **limits: float | None) -> dict[str, Any]:

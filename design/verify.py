@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from design.distinct import apart
+from design.form import Form, described
 from design.outcome import Outcome, Trial
 from design.rules import broken
-from design.space import Form, described
 
 
 @dataclass

@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from design.form import Form
 from design.parameters import distributions, ordered, to_centres, to_parameters
 from design.rows import RowSpace
-from design.space import DesignSpace, Form, built, design_space
+from design.space import DesignSpace, built, design_space
 from gns_env.layout import LayoutSpace
 from gns_model.errors import LayoutError
 from gns_model.footprint import separation
