@@ -23,11 +23,11 @@ from design.ensemble import Ensemble, beyond_limits, relative_spread
 from design.evaluators import SimulatorSpec
 from design.outcome import Outcome
 from design.store import Pending, Rolled, RolloutStore, Watch
-from design.verify import spearman
 from design.workers import Workers
 from gns_env.objective import Objective
 from gns_model import measures
 from gns_model.console import print_table, progress_bar
+from gns_model.evaluation import rank_correlation
 from gns_model.files import write_whole
 from gns_model.learned.checkpoint import CARD, read_card
 from gns_model.scene import Scene
@@ -165,7 +165,7 @@ def print_correlations(judged: Sequence[Judgement], limits: dict[str, float]) ->
         cells = []
         for m in MEASURES:
             pairs = np.array([(j.spread[m], j.error[m]) for j in chosen])
-            rank = spearman(*pairs[np.isfinite(pairs).all(axis=1)].T)
+            rank = rank_correlation(*pairs[np.isfinite(pairs).all(axis=1)].T)
             cells.append("-" if rank is None else f"{rank:+.2f}")
         rows.append([f"{name} ({len(chosen)})", *cells])
     for name, sign in (("mean error in %, marked", True), ("mean error in %, not marked", False)):
@@ -178,7 +178,8 @@ def print_correlations(judged: Sequence[Judgement], limits: dict[str, float]) ->
     one, mean = (np.array([getattr(j, k) for j in unseen]) for k in ("first_cost", "mean_cost"))
     print(
         "Rank correlation of the objective with the truth, unseen layouts: the model alone "
-        f"{spearman(one, true) or 0:.3f}, mean of all {spearman(mean, true) or 0:.3f}"
+        f"{rank_correlation(one, true) or 0:.3f}, mean of all "
+        f"{rank_correlation(mean, true) or 0:.3f}"
     )
 
 

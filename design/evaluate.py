@@ -92,17 +92,10 @@ def with_layout(scene: Scene, path: Path) -> Scene:
     Raises:
         SceneError: if the file cannot be read, names no baffle, or they do not fit the scene.
     """
-    import tomllib
-
     from gns_model.errors import SceneError
+    from gns_model.toml import read_toml
 
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SceneError(f"{path}: cannot be read ({error.strerror})") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SceneError(f"{path}: not a TOML file ({error})") from None
-    entries = values.get("baffle")
+    entries = read_toml(path, SceneError).get("baffle")
     if not isinstance(entries, list) or not entries:
         raise SceneError(f"{path}: no [[baffle]] in it, so there is no layout to evaluate")
     return _placed(scene, tuple(entries), path)

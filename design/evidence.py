@@ -11,7 +11,7 @@ from design.answer import HEADLINE
 from design.drawing import thumbnail
 from design.flow_figures import shown_flows
 from design.results import RunResults
-from design.verify import spearman
+from gns_model.evaluation import rank_correlation
 
 #: Figures by name as PNG bytes, for paper and for a dark screen.
 Pictures = dict[str, tuple[bytes, bytes]]
@@ -73,7 +73,7 @@ def trust(run: RunResults, pictures: Pictures) -> str:
         if not gaps:
             continue
         learned, solver = np.array([p[1:] for p in pairs]).T
-        rank = spearman(learned, solver)
+        rank = rank_correlation(learned, solver)
         mine = [(s, v) for d, s, v in pairs if d is best]
         of_best = mine[0] if mine else (None, None)
         rows.append(

@@ -17,6 +17,7 @@ from design.distinct import apart
 from design.form import Form, described
 from design.outcome import Outcome, Trial
 from design.rules import broken
+from gns_model.evaluation import rank_correlation
 
 
 @dataclass
@@ -167,21 +168,11 @@ def gap(judged: Sequence[Judged]) -> dict[str, dict[str, float]]:
                 "mean_relative": float(relative.mean()),
                 "max_relative": float(relative.max()),
             }
-        correlation = spearman(s, v)
+        correlation = rank_correlation(s, v)
         if correlation is not None:
             entry["spearman"] = correlation
         result[name] = entry
     return result
-
-
-def spearman(a: np.ndarray, b: np.ndarray) -> float | None:
-    """Rank correlation of two samples (n,), or None below three or where one is constant."""
-    from scipy.stats import rankdata
-
-    if len(a) < 3 or np.ptp(a) == 0 or np.ptp(b) == 0:
-        return None
-    value = float(np.corrcoef(rankdata(a), rankdata(b))[0, 1])
-    return value if math.isfinite(value) else None
 
 
 def verdict(best: Judged | None, paper: Judged | None, none: float) -> tuple[str, str]:

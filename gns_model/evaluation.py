@@ -2,8 +2,7 @@
 
 A mean error of 1% hides a simulator that gives every layout the same answer (findings: one did).
 So beside mean errors stand the slope of predicted on true, the rank correlation and the spread of
-both over the scenes, and `gradient_check` compares the derivative of a whole rollout in the layout
-with central differences.
+both over the scenes.
 
 The truth of a scene is read off ALL points of its reference trajectory, also where the simulator
 fills the scene with fewer. Points are compared by their displacement from the nearest reference
@@ -24,7 +23,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from rich.table import Table
 from scipy.spatial import cKDTree
 from scipy.stats import spearmanr
@@ -32,10 +30,8 @@ from scipy.stats import spearmanr
 from gns_model import measures
 from gns_model.errors import SimulatorError
 from gns_model.files import write_whole
-from gns_model.learned.adjoint import ADJOINT_LIMIT, ADJOINT_SMOOTHING
 from gns_model.scene import Scene
 from gns_model.simulator import Progress, Simulator
-from gns_model.smooth_measures import TEMPERATURE, smooth_measures
 from gns_model.trajectory import OK, Trajectory
 
 #: The measures that are judged, and the least denominator of their relative error: below it a
@@ -137,7 +133,7 @@ class Comparison:
             out[f"{name}.error"] = float(np.abs(relative).mean())
             out[f"{name}.bias"] = float(relative.mean())
             out[f"{name}.slope"] = _slope(true, predicted)
-            out[f"{name}.spearman"] = _rank_correlation(true, predicted)
+            out[f"{name}.spearman"] = rank_correlation(true, predicted)
             out[f"{name}.spread"] = float(predicted.std())
             out[f"{name}.spread_true"] = float(true.std())
         out["points_inside"] = sum(r.points_inside for r in self.results) / sum(
@@ -324,120 +320,6 @@ def point_rmse(prediction: Trajectory, reference: Trajectory) -> float:
     return float(np.sqrt(np.square(difference).sum(axis=1).mean()))
 
 
-@dataclass(frozen=True)
-class GradientCheck:
-    """Derivative of a smooth measure in the baffle centres, two ways, shape (B, D-1) each.
-
-    `cosine` is that between the two, 1 where they agree in direction; `ratio` is the norm of the
-    automatic over that of the central differences.
-    """
-
-    measure: str
-    step: float
-    value: float
-    autograd: np.ndarray
-    differences: np.ndarray
-    seconds: float
-
-    @property
-    def cosine(self) -> float:
-        norms = np.linalg.norm(self.autograd) * np.linalg.norm(self.differences)
-        # A rollout that diverged has a norm of NaN, which agrees with nothing either.
-        return float((self.autograd * self.differences).sum() / norms) if norms > 0 else 0.0
-
-    @property
-    def ratio(self) -> float:
-        norm = np.linalg.norm(self.differences)
-        return float(np.linalg.norm(self.autograd) / norm) if norm else math.inf
-
-
-def gradient_check(
-    simulator: Any,
-    scene: Scene,
-    *,
-    measure: str = "centroid_travel",
-    step: float = 0.01,
-    frames: int | None = None,
-    temperature: float = TEMPERATURE,
-    dtype: torch.dtype | None = None,
-    limit: float | None = ADJOINT_LIMIT,
-    smoothing: float = ADJOINT_SMOOTHING,
-) -> GradientCheck:
-    """Autograd through a whole rollout against central differences in every baffle coordinate.
-
-    Args:
-        simulator: a learned simulator, with `rollout_tensor`.
-        scene: with at least one baffle, each `step` away from anything it must not touch.
-        measure: an entry of `smooth_measures`.
-        step: of the central differences [m]. Far below 1 cm they see the round-off of a chaotic
-            flow rather than its trend.
-        frames: frames to roll out, the start included; default: the whole duration.
-        temperature: of the smooth measures [m].
-        dtype: of the centres; default: that of the simulator.
-        limit, smoothing: of the adjoints, as the gradient search has them; None and 0: the exact
-            gradient.
-
-    Raises:
-        SimulatorError: if the simulator is not differentiable or the scene has no baffle.
-        SceneError: if a baffle cannot move by `step`.
-    """
-    if not hasattr(simulator, "rollout_tensor"):
-        raise SimulatorError(f"{simulator.name!r} is not differentiable: give a learned simulator")
-    if not scene.baffles:
-        raise SimulatorError(f"scene {scene.name!r} has no baffle to differentiate by")
-    began = time.perf_counter()
-    device = getattr(simulator, "device", "cpu")
-    dtype = dtype or getattr(simulator, "dtype", torch.float32)
-    start = np.array([b.center for b in scene.baffles])
-    sizes = torch.tensor([b.size for b in scene.baffles], dtype=dtype, device=device)
-    centres = torch.tensor(start, dtype=dtype, device=device, requires_grad=True)
-    positions = simulator.rollout_tensor(
-        [scene], [centres], frames=frames, limit=limit, smoothing=smoothing
-    )[0]
-    form: dict[str, Any] = {"sizes": sizes, "temperature": temperature}
-    if scene.is_turned:
-        form["yaws"] = torch.tensor([b.yaw for b in scene.baffles], dtype=dtype, device=device)
-    value = smooth_measures(positions, scene, centres, **form)[measure]
-    (gradient,) = torch.autograd.grad(value, centres)
-
-    shifted = []
-    for index in np.ndindex(*start.shape):
-        for sign in (1.0, -1.0):
-            moved = start.copy()
-            moved[index] += sign * step
-            shifted.append(moved)
-    # Scenes are built first: a layout that cannot be is refused before any rollout is paid for.
-    scenes = [moved_baffles(scene, moved) for moved in shifted]
-    values = []
-    with torch.no_grad():
-        for moved, there in zip(shifted, scenes, strict=True):
-            at = torch.tensor(moved, dtype=dtype, device=device)
-            positions = simulator.rollout_tensor([there], [at], frames=frames)[0]
-            values.append(float(smooth_measures(positions, there, at, **form)[measure]))
-    ahead, behind = np.array(values).reshape(-1, 2).T
-    return GradientCheck(
-        measure=measure,
-        step=step,
-        value=float(value.detach()),
-        autograd=gradient.cpu().numpy().astype(float),
-        differences=((ahead - behind) / (2 * step)).reshape(start.shape),
-        seconds=time.perf_counter() - began,
-    )
-
-
-def moved_baffles(scene: Scene, centres: np.ndarray) -> Scene:
-    """The scene with its own baffles, each with size and yaw, at `centres` [m], shape (B, D-1).
-
-    Raises:
-        SceneError: if one of them leaves the domain or overlaps something.
-    """
-    baffles = tuple(
-        {"center": tuple(map(float, c)), "size": b.size, "yaw": b.yaw}
-        for c, b in zip(centres, scene.baffles, strict=True)
-    )
-    return scene.replace(baffles=baffles)
-
-
 def _slope(true: np.ndarray, predicted: np.ndarray) -> float | None:
     spread = true - true.mean()
     square = float((spread**2).sum())
@@ -446,10 +328,12 @@ def _slope(true: np.ndarray, predicted: np.ndarray) -> float | None:
     return float((spread * predicted).sum() / square)
 
 
-def _rank_correlation(true: np.ndarray, predicted: np.ndarray) -> float | None:
-    if len(true) < 3 or np.ptp(true) == 0 or np.ptp(predicted) == 0:
+def rank_correlation(a: np.ndarray, b: np.ndarray) -> float | None:
+    """Spearman's of two samples (n,), or None below three or where one is constant."""
+    if len(a) < 3 or np.ptp(a) == 0 or np.ptp(b) == 0:
         return None
-    return float(spearmanr(true, predicted).statistic)
+    value = float(spearmanr(a, b).statistic)
+    return value if math.isfinite(value) else None
 
 
 def _met(value: float | None, bounds: tuple[float, float]) -> bool | None:

@@ -23,7 +23,6 @@ value, and is read from and written to TOML.
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -46,7 +45,7 @@ from gns_model.parts import (
     Vector,
 )
 from gns_model.placement import Placement
-from gns_model.toml_text import toml_text
+from gns_model.toml import read_toml, toml_text
 
 
 class Scene(Part):
@@ -243,13 +242,7 @@ class Scene(Part):
             SceneError: if it is missing, is not TOML or is not a scene.
         """
         path = Path(path)
-        try:
-            values = tomllib.loads(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise SceneError(f"{path}: cannot be read ({error.strerror})") from None
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise SceneError(f"{path}: not a TOML file ({error})") from None
-        return cls.from_dict(values, source=str(path))
+        return cls.from_dict(read_toml(path, SceneError), source=str(path))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values that `from_dict` reads back."""

@@ -11,7 +11,7 @@ from gns_model.suites.collapse import (
     paper_columns,
     runout_aims,
 )
-from gns_model.suites.pair import outside, simulate
+from gns_model.suites.pair import CLOSING, PAPERS_RUNOUTS, RUNOUTS, outside, simulate
 from gns_model.suites.result import SuiteResult
 from gns_model.suites.setup import Setup
 
@@ -22,15 +22,9 @@ FRAMED = (0.8, 2.0)
 
 SHOWN = (
     ("aspect", "a = H0/L0", "g"),
-    ("runout_mpm", "our MPM", ".3f"),
-    ("runout", "learned", ".3f"),
-    ("runout_error", "error", "+.1%"),
-    ("paper_mpm", "paper's MPM", ".3f"),
-    ("paper_gns", "paper's GNS", ".3f"),
-    ("paper_error", "its error", "+.1%"),
-    ("position_mse", "position MSE [m²]", ".1e"),
-    ("seconds", "seconds", ".1f"),
-    ("status", "status", "s"),
+    *RUNOUTS,
+    *PAPERS_RUNOUTS,
+    *CLOSING,
 )
 
 

@@ -165,8 +165,9 @@ def _on_data(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    from gns_model.evaluation import compare, gradient_check
+    from gns_model.evaluation import compare
     from gns_model.files import write_whole
+    from gns_model.gradient_check import gradient_check
     from gns_model.simulator import load_simulator
     from gns_model.trajectory import Trajectory
 

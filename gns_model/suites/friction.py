@@ -9,7 +9,7 @@ from gns_model import paper
 from gns_model.simulator import Simulator
 from gns_model.suites import column_figures
 from gns_model.suites.collapse import collapse_row, runout_aims
-from gns_model.suites.pair import outside, simulate
+from gns_model.suites.pair import CLOSING, RUNOUTS, outside, simulate
 from gns_model.suites.result import Row, SuiteResult
 from gns_model.suites.setup import Setup
 
@@ -21,12 +21,8 @@ DOMAIN = (2.0, 0.5)
 SHOWN = (
     ("friction_angle", "friction angle [°]", "g"),
     ("aspect", "a = H0/L0", "g"),
-    ("runout_mpm", "our MPM", ".3f"),
-    ("runout", "learned", ".3f"),
-    ("runout_error", "error", "+.1%"),
-    ("position_mse", "position MSE [m²]", ".1e"),
-    ("seconds", "seconds", ".1f"),
-    ("status", "status", "s"),
+    *RUNOUTS,
+    *CLOSING,
 )
 
 

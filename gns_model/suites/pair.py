@@ -16,6 +16,23 @@ from gns_model.suites.reference import references
 from gns_model.suites.setup import Setup, stride
 from gns_model.trajectory import OK, Trajectory
 
+#: What tables of columns show: (entry of a row, heading, format).
+RUNOUTS = (
+    ("runout_mpm", "our MPM", ".3f"),
+    ("runout", "learned", ".3f"),
+    ("runout_error", "error", "+.1%"),
+)
+PAPERS_RUNOUTS = (
+    ("paper_mpm", "paper's MPM", ".3f"),
+    ("paper_gns", "paper's GNS", ".3f"),
+    ("paper_error", "its error", "+.1%"),
+)
+CLOSING = (
+    ("position_mse", "position MSE [m²]", ".1e"),
+    ("seconds", "seconds", ".1f"),
+    ("status", "status", "s"),
+)
+
 
 @dataclass(frozen=True)
 class Pair:

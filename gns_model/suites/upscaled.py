@@ -6,7 +6,14 @@ from gns_model import paper
 from gns_model.simulator import Simulator
 from gns_model.suites import column_figures, frames
 from gns_model.suites.collapse import collapse_curves, collapse_row, paper_columns
-from gns_model.suites.pair import outside, simulate, squared_errors
+from gns_model.suites.pair import (
+    CLOSING,
+    PAPERS_RUNOUTS,
+    RUNOUTS,
+    outside,
+    simulate,
+    squared_errors,
+)
 from gns_model.suites.result import Aim, Row, SuiteResult
 from gns_model.suites.setup import Setup
 
@@ -17,15 +24,9 @@ RUNOUT_AIM = 0.02
 SHOWN = (
     ("case", "column", "s"),
     ("points", "points", "d"),
-    ("runout_mpm", "our MPM", ".3f"),
-    ("runout", "learned", ".3f"),
-    ("runout_error", "error", "+.1%"),
-    ("paper_mpm", "paper's MPM", ".3f"),
-    ("paper_gns", "paper's GNS", ".3f"),
-    ("paper_error", "its error", "+.1%"),
-    ("position_mse", "position MSE [m²]", ".1e"),
-    ("seconds", "seconds", ".1f"),
-    ("status", "status", "s"),
+    *RUNOUTS,
+    *PAPERS_RUNOUTS,
+    *CLOSING,
 )
 
 

@@ -3,7 +3,7 @@ import pytest
 
 from design.outcome import Outcome, Trial
 from design.risk import Flow, Risk, weigh
-from design.verify import Judged, candidates, gap, rank, spearman, verdict
+from design.verify import Judged, candidates, gap, rank, verdict
 from gns_env.objective import Objective
 
 NONE = {"centroid_travel": 0.65, "upstream_depth": 0.2}
@@ -69,13 +69,3 @@ def test_the_gap_is_relative_to_the_solver_and_ranks():
     assert found["centroid_travel"]["max_relative"] == pytest.approx(expected.max())
     assert "spearman" not in found["centroid_travel"]  # the surrogate says 0.6 of all
     assert gap([Judged("bayes", LAYOUT, {}, 1.0)]) == {}
-
-
-def test_spearman_is_the_rank_correlation():
-    rng = np.random.default_rng(0)
-    a, b = rng.random(12), rng.random(12)
-    from scipy.stats import spearmanr
-
-    assert spearman(a, b) == pytest.approx(spearmanr(a, b).statistic)
-    assert spearman(a[:2], b[:2]) is None
-    assert spearman(a, np.ones(12)) is None

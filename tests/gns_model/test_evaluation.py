@@ -19,10 +19,11 @@ from gns_model.evaluation import (
     compare,
     deposit_error,
     deposit_map,
-    gradient_check,
     point_rmse,
+    rank_correlation,
 )
 from gns_model.evaluation_figures import deposit_figure, scatter_figure
+from gns_model.gradient_check import gradient_check
 from gns_model.learned import LearnedModel, LearnedSimulator, ModelConfig
 from gns_model.mpm import MpmSimulator
 from gns_model.particles import MOVING, fill
@@ -311,6 +312,15 @@ def test_the_solver_against_itself_at_half_the_spacing(small_flume: Scene):
     assert all(0 < r.true["upstream_depth"] < 0.3 for r in comparison.results)
     assert all(r.true["energy_dissipated"] > 0 for r in comparison.results)
     assert numbers["speedup"] is not None
+
+
+def test_a_rank_correlation_knows_ranks_only_and_needs_three():
+    a = np.random.default_rng(0).normal(size=12)
+    assert rank_correlation(a, np.exp(a)) == pytest.approx(1)
+    assert rank_correlation(a, -(a**3)) == pytest.approx(-1)
+    assert rank_correlation(np.arange(4), np.array([0, 1, 3, 2])) == pytest.approx(0.8)
+    assert rank_correlation(a[:2], a[:2]) is None
+    assert rank_correlation(a, np.ones(12)) is None
 
 
 # -- gradients -------------------------------------------------------------------------------------

@@ -1,9 +1,27 @@
-"""Plain values as TOML text, for files that a person reads and edits."""
+"""TOML in and out: files that a person reads and edits."""
 
 from __future__ import annotations
 
 import json
+import tomllib
+from pathlib import Path
 from typing import Any
+
+from gns_model.errors import GnsError
+
+
+def read_toml(path: Path, error: type[GnsError]) -> dict[str, Any]:
+    """The values in a TOML file.
+
+    Raises:
+        error: if it is missing or is not TOML; one line that names the file.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as fault:
+        raise error(f"{path}: cannot be read ({fault.strerror})") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as fault:
+        raise error(f"{path}: not a TOML file ({fault})") from None
 
 
 def toml_text(values: dict[str, Any]) -> str:
