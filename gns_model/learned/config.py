@@ -151,6 +151,9 @@ class ModelConfig(BaseModel):
     #: points, which need `types`. "none": it sees no baffles, and refuses scenes that have some.
     baffles: Literal["distance", "points", "none"] = "distance"
     baffle_range: Positive = 0.1  #: where the influence of a baffle on the features ends [m]
+    #: Give vertices the overburden, the flow depth and its slope, of the mass within this distance
+    #: along the base [m]; 0: leave them out, as the paper does. See `features.depth_features`.
+    depth_range: NonNegative = 0.0
     #: Push points out of the boxes and into the domain after every step.
     project: bool = True
 
@@ -196,6 +199,7 @@ class ModelConfig(BaseModel):
     def vertex_inputs(self) -> int:
         """Width of the vertex features, without the type embedding."""
         width = self.history * self.dim + 2 * self.dim + len(self.material_features)
+        width += self.dim + 1 if self.depth_range else 0
         return width + (self.dim + 2 if self.baffles == "distance" else 0)
 
     @property

@@ -7,8 +7,15 @@ settings, which clip).
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
+
+from gns_model.learned.graph import radius_graph
+
+#: Overburden and flow depth are given in this unit [m], of which a bench-scale flow has a few.
+DEPTH_UNIT = 0.1
 
 
 def fade(distance: Tensor, reach: float) -> Tensor:
@@ -116,6 +123,44 @@ def baffle_features(
     weight = fade(distance, reach)[..., None]
     approach = (normal * velocity[:, None]).sum(-1, keepdim=True)
     return (weight * torch.cat([torch.ones_like(weight), normal, approach], dim=-1)).sum(1)
+
+
+def depth_features(
+    positions: Tensor, moving: Tensor, batch: Tensor, reach: float, spacing: float
+) -> Tensor:
+    """Overburden, flow depth and its slope along the base at every point, shape (N, D + 1).
+
+    With material of depth h(x), h = spacing^D / A · Σ_j W(|x_j - x| / reach), where x is the place
+    on the base, W(q) = (1 - q²)³ fades with two derivatives and A is its integral: the height of
+    the mass that stands on a spot. The overburden counts what lies above the point alone, over a
+    soft step of half a spacing. Both are in DEPTH_UNIT; the slope, ∂h/∂x, is a pure number. What
+    drives a granular flow is in depth-averaged theory g ∂h/∂x (Savage & Hutter 1989), and its
+    friction is that of the overburden; messages would have to carry both through the whole depth.
+
+    Args:
+        positions: [m], shape (N, D); axis 1 is height.
+        moving: mask of the points that have weight, shape (N,).
+        batch: scene of every point, shape (N,).
+        reach: of W along the base [m].
+        spacing: of the points [m].
+    """
+    dim = positions.shape[1]
+    plan = positions[:, ::2] if dim == 3 else positions[:, :1]
+    flat = torch.cat([plan, torch.zeros_like(plan)], dim=1)[:, :2]
+    senders, receivers = radius_graph(flat.detach(), reach, batch, self_edges=True)
+    carried = moving[senders].to(positions.dtype)
+    offset = (plan[receivers] - plan[senders]) / reach
+    inside = 1 - offset.square().sum(1)
+    # ∫ (1 - q²)³ over the line is 32/35 of the reach, over the disc π/4 of its square.
+    area = 32 / 35 * reach if dim == 2 else math.pi / 4 * reach**2
+    weight = spacing**dim / area * carried * inside**3
+    above = torch.sigmoid((positions[senders, 1] - positions[receivers, 1]) * (4 / spacing))
+    steep = (-6 / reach) * (spacing**dim / area * carried * inside**2)[:, None] * offset
+    parts = torch.cat(
+        [(weight * above / DEPTH_UNIT)[:, None], (weight / DEPTH_UNIT)[:, None], steep], dim=1
+    )
+    summed = positions.new_zeros((len(positions), dim + 1))
+    return summed.index_add(0, receivers, parts)
 
 
 def edge_features(

@@ -119,6 +119,12 @@ class LearnedModel(nn.Module):
                     world.point_frames,
                 )
             )
+        if config.depth_range:
+            parts.append(
+                features.depth_features(
+                    positions, world.moving, world.batch, config.depth_range, config.spacing
+                )
+            )
         if config.material_features:
             columns = [MATERIAL_FEATURES.index(name) for name in config.material_features]
             parts.append(world.point_material[:, columns])

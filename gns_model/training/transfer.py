@@ -14,8 +14,10 @@ from gns_model.learned.model import LearnedModel
 from gns_model.training.recipe import RecipeError
 
 #: What may differ between the two configurations: the weights do not depend on it, or, for the
-#: material features, `inherit` makes room.
-FREE = {"noise_std", "subcells", "limits", "bounds", "solver_steps", "material_features"}
+#: last two, `inherit` makes room.
+FREE = {
+    "noise_std", "subcells", "limits", "bounds", "solver_steps", "material_features", "depth_range",
+}  # fmt: skip
 
 _FIRST = "network.encode_vertex.layers.0.weight"
 
@@ -24,8 +26,8 @@ _FIRST = "network.encode_vertex.layers.0.weight"
 def inherit(model: LearnedModel, start_from: str) -> None:
     """Copy weights and normalisation of the model `start_from` into `model`, in place.
 
-    Material features that only `model` has get weights of zero: it begins by ignoring them, and
-    moves points exactly as its parent does.
+    Material and depth features that only `model` has get weights of zero: it begins by ignoring
+    them, and moves points exactly as its parent does.
 
     Args:
         start_from: a shipped model or a checkpoint folder.
@@ -44,16 +46,26 @@ def inherit(model: LearnedModel, start_from: str) -> None:
     mine, theirs = model.config, parent.config
     _check(mine, theirs, start_from)
     state = parent.state_dict()
-    own, known = mine.material_features, theirs.material_features
+    own, known = _inputs(mine), _inputs(theirs)
     if own != known:
         weight = state[_FIRST]
-        # Inputs of the vertex encoder: motion and surroundings, material, type embedding.
-        begin = theirs.vertex_inputs - len(known)
-        columns = {name: weight[:, begin + k] for k, name in enumerate(known)}
-        material = [columns.get(name, torch.zeros_like(weight[:, 0])) for name in own]
-        after = weight[:, begin + len(known) :]
-        state[_FIRST] = torch.cat([weight[:, :begin], torch.stack(material, dim=1), after], dim=1)
+        columns = dict(zip(known, weight.unbind(1), strict=True))
+        state[_FIRST] = torch.stack(
+            [columns.get(name, torch.zeros_like(weight[:, 0])) for name in own], dim=1
+        )
     model.load_state_dict(state)
+
+
+def _inputs(config: ModelConfig) -> list[str]:
+    """A name for every input of the vertex encoder, in its order."""
+    depth = [f"depth {k}" for k in range(config.dim + 1)] if config.depth_range else []
+    material = list(config.material_features)
+    embedded = config.type_embedding if config.types else 0
+    surroundings = range(config.vertex_inputs - len(depth) - len(material))
+    return [
+        *(f"surroundings {k}" for k in surroundings), *depth, *material,
+        *(f"type {k}" for k in range(embedded)),
+    ]  # fmt: skip
 
 
 def _check(mine: ModelConfig, theirs: ModelConfig, name: str) -> None:
@@ -64,6 +76,11 @@ def _check(mine: ModelConfig, theirs: ModelConfig, name: str) -> None:
             raise RecipeError(
                 f"start_from = {name!r}: its {key} is {found[key]!r}, the recipe's {value!r}"
             )
+    if theirs.depth_range and mine.depth_range != theirs.depth_range:
+        raise RecipeError(
+            f"start_from = {name!r}: its depth_range is {theirs.depth_range:g}, the recipe's "
+            f"{mine.depth_range:g}"
+        )
     dropped = set(theirs.material_features) - set(mine.material_features)
     if dropped:
         raise RecipeError(
