@@ -257,6 +257,7 @@ def _forward_and_backward(
                 moving=batch.moving,
                 linear_beyond=recipe.linear_beyond,
                 momentum_weight=recipe.momentum_weight,
+                front_weight=recipe.front_weight,
             )
         replay.advanced(after)
     else:
@@ -275,6 +276,7 @@ def _forward_and_backward(
                 backprop=recipe.backprop_through_unroll,
                 linear_beyond=recipe.linear_beyond,
                 momentum_weight=recipe.momentum_weight,
+                front_weight=recipe.front_weight,
                 return_steps=recipe.return_steps,
             )
     run.optimiser.zero_grad(set_to_none=True)

@@ -12,6 +12,9 @@ from torch import Tensor
 from gns_model.learned.model import LearnedModel
 from gns_model.training.batches import Batch
 
+#: Share of a scene's moving points that are its front: those farthest along x.
+FRONT = 0.05
+
 
 def step_error(
     model: LearnedModel,
@@ -23,6 +26,7 @@ def step_error(
     moving: Tensor | None = None,
     linear_beyond: float | None = None,
     momentum_weight: float = 0.0,
+    front_weight: float = 0.0,
 ) -> Tensor:
     """Mean square of the normalised acceleration error, a scalar.
 
@@ -42,19 +46,25 @@ def step_error(
         momentum_weight: of the mean over scenes of the square (or pseudo-Huber) of a scene's mean
             error. An error that all points share moves the centroid, or lets a heap sink into
             itself, and hardly shows in the mean of squares.
+        front_weight: likewise of the mean error of a scene's front (`FRONT`), a twentieth of the
+            points that decides the runout, and a twentieth of the mean of squares.
     """
-    error = (after - history[:, -1]) - move
+    place, error = history[:, -1, 0], (after - history[:, -1]) - move
     if moving is not None:
-        error = error[moving]
+        place, error = place[moving], error[moving]
         batch = None if batch is None else batch[moving]
     error = error / (model.config.dt**2 * model.acceleration_std)
     loss = _penalty(error, linear_beyond).mean()
-    if momentum_weight == 0:
-        return loss
     if batch is None:
         batch = torch.zeros(len(error), dtype=torch.long, device=error.device)
-    mean = _scene_mean(error, batch)
-    return loss + momentum_weight * _penalty(mean, linear_beyond).mean()
+    if momentum_weight:
+        mean = _scene_mean(error, batch)
+        loss = loss + momentum_weight * _penalty(mean, linear_beyond).mean()
+    if front_weight:
+        ahead = _front(place.detach(), batch)
+        mean = _scene_mean(error[ahead], batch[ahead])
+        loss = loss + front_weight * _penalty(mean, linear_beyond).mean()
+    return loss
 
 
 def _penalty(error: Tensor, linear_beyond: float | None) -> Tensor:
@@ -72,6 +82,17 @@ def _scene_mean(values: Tensor, batch: Tensor) -> Tensor:
     return values.new_zeros((len(counts), values.shape[1])).index_add(0, batch, values) / counts
 
 
+def _front(place: Tensor, batch: Tensor) -> Tensor:
+    """Indices of the `FRONT` of every scene by `place` along x [m], shape (N,); at least a point
+    of each."""
+    counts = torch.bincount(batch).tolist()
+    order = batch.argsort(stable=True)
+    parts = zip(order.split(counts), place[order].split(counts), strict=True)
+    return torch.cat(
+        [own[x.topk(min(len(x), 1 + int(FRONT * len(x)))).indices] for own, x in parts]
+    )
+
+
 def unrolled_loss(
     model: LearnedModel,
     batch: Batch,
@@ -80,6 +101,7 @@ def unrolled_loss(
     backprop: bool = False,
     linear_beyond: float | None = None,
     momentum_weight: float = 0.0,
+    front_weight: float = 0.0,
     return_steps: float | None = None,
 ) -> Tensor:
     """Loss after the model has taken `steps` steps on its own, a scalar.
@@ -89,7 +111,7 @@ def unrolled_loss(
         backprop: mean of all steps' errors with gradients through all of them. Otherwise
             push-forward (Brandstetter et al. 2022): the first steps only prepare an input with
             the model's own error, and the last one is the loss.
-        linear_beyond, momentum_weight: see `step_error`.
+        linear_beyond, momentum_weight, front_weight: see `step_error`.
         return_steps: with push-forward, also ask for 1/return_steps of the way back: the true
             displacement less that part of how far a point has drifted from the truth. A heap that
             sinks into itself by a hair each step is one-step perfect and a puddle after fifty; so
@@ -106,6 +128,7 @@ def unrolled_loss(
             moving=batch.moving,
             linear_beyond=linear_beyond,
             momentum_weight=momentum_weight,
+            front_weight=front_weight,
         )
 
     history = batch.history

@@ -62,6 +62,7 @@ class Recipe(BaseModel):
     linear_beyond: Positive | None = None
     #: Weight of the error that all points of a scene share; see `loss.step_error`.
     momentum_weight: NonNegative = 0.0
+    front_weight: NonNegative = 0.0  #: likewise of the front of a scene
     early: Fraction = 0.0  #: share of windows from the first `early_steps` steps of a rollout
     early_steps: Count = 8  #: 0.16 s at a stride of 0.02 s: a release turns into a flow
     clip_norm: Positive = 1.0  #: of the whole gradient

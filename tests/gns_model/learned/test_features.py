@@ -1,12 +1,15 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gns_model.learned.features import (
+    DEPTH_UNIT,
     baffle_features,
+    depth_features,
     edge_features,
     envelope,
     fade,
@@ -97,3 +100,53 @@ def test_edge_features_are_receiver_minus_sender_and_differentiable_when_points_
     assert edge_features(points, None, senders, receivers, 0.5)[0].shape == (2, 3)
     norm.sum().backward()
     assert torch.isfinite(points.grad).all()
+
+
+def heap(dim: int, spacing: float = 0.02, height=lambda x: 0.3 + 0.0 * x) -> torch.Tensor:
+    """A lattice over 0.6 m (x 0.4 m) whose free surface lies at `height` [m] above x."""
+    axis = [(torch.arange(round(e / spacing)) + 0.5) * spacing for e in (0.6, 0.6, 0.4)[:dim]]
+    points = torch.cartesian_prod(*axis).double()
+    return points[points[:, 1] < height(points[:, 0])]
+
+
+def depths(points, spacing=0.02, reach=0.06, moving=None, batch=None):
+    moving = torch.ones(len(points), dtype=torch.bool) if moving is None else moving
+    batch = torch.zeros(len(points), dtype=torch.int64) if batch is None else batch
+    return depth_features(points, moving, batch, reach, spacing)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_depth_features_of_a_layer_and_of_a_wedge(dim):
+    points = heap(dim)
+    inner = (points[:, ::2] > 0.07).all(1)
+    inner &= (points[:, 0] < 0.53) & ((points[:, 2] < 0.33) if dim == 3 else True)
+    over, depth, *slope = depths(points)[inner].T
+    torch.testing.assert_close(depth * DEPTH_UNIT, torch.full_like(depth, 0.3), rtol=0.02, atol=0)
+    buried = 0.3 - points[inner, 1]
+    torch.testing.assert_close(over * DEPTH_UNIT, buried, rtol=0.02, atol=0.004)
+    assert torch.stack(slope).abs().max() < 1e-4
+
+    points = heap(dim, height=lambda x: 0.4 - 0.5 * x)
+    inner = (points[:, 0] > 0.15) & (points[:, 0] < 0.45)
+    if dim == 3:
+        inner &= (points[:, 2] > 0.07) & (points[:, 2] < 0.33)
+    slope = depths(points, reach=0.1)[inner, 2]
+    assert slope.mean().item() == pytest.approx(-0.5, abs=0.02)
+
+
+def test_depth_features_see_what_has_weight_in_their_own_scene():
+    points = heap(2)
+    alone = depths(points)
+    twice = torch.cat([points, points])
+    scene = torch.arange(2).repeat_interleave(len(points))
+    torch.testing.assert_close(depths(twice, batch=scene), torch.cat([alone, alone]))
+    fixed = depths(twice, moving=scene == 0)
+    torch.testing.assert_close(fixed, torch.cat([alone, alone]))
+    assert (depths(twice)[:, 1] > 1.9 * alone[:, 1].repeat(2)).all()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_gradient_of_depth_features(dim):
+    shift = torch.rand((12, dim), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    points = (shift * 0.1).requires_grad_()
+    assert torch.autograd.gradcheck(lambda p: depths(p), points, eps=1e-7, atol=1e-5)

@@ -8,6 +8,7 @@ from gns_model.learned.world import baffle_boxes, baffle_points
 from gns_model.particles import MOVING, STATIONARY, fill
 
 DIMS = pytest.mark.parametrize("dim", [2, 3])
+DEPTH = pytest.mark.parametrize("depth_range", [0.0, 0.1])
 
 
 def start(model, scene, dtype=torch.float32, seed=0):
@@ -24,8 +25,9 @@ def start(model, scene, dtype=torch.float32, seed=0):
 
 
 @DIMS
-def test_permutation(make_model, make_scene, dim):
-    model, scene = make_model(dim=dim), make_scene(dim)
+@DEPTH
+def test_permutation(make_model, make_scene, dim, depth_range):
+    model, scene = make_model(dim=dim, depth_range=depth_range), make_scene(dim)
     history, world = start(model, scene)
     order = torch.randperm(len(history), generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
@@ -35,8 +37,9 @@ def test_permutation(make_model, make_scene, dim):
 
 
 @DIMS
-def test_translation_with_the_domain(make_model, make_scene, dim):
-    model = make_model(dim=dim)
+@DEPTH
+def test_translation_with_the_domain(make_model, make_scene, dim, depth_range):
+    model = make_model(dim=dim, depth_range=depth_range)
     history, world = start(model, make_scene(dim))
     shift = (0.25, -0.5, 0.125)
     moved = make_scene(dim, shift)
@@ -50,7 +53,7 @@ def test_translation_with_the_domain(make_model, make_scene, dim):
 def test_mirror_symmetric_features_do_not_favour_a_side(make_model, make_scene):
     # Weights know left from right; what they are fed must not: a step of the mirrored scene by
     # the network with mirrored inputs is the mirrored step.
-    model = make_model()
+    model = make_model(depth_range=0.1)
     scene = make_scene()
     history, world = start(model, scene)
     z = make_scene().domain.upper[2]
@@ -70,6 +73,7 @@ def test_mirror_symmetric_features_do_not_favour_a_side(make_model, make_scene):
     walls = 3 * config.history
     order[[walls + 2, walls + 5]] = order[[walls + 5, walls + 2]]  # the two side walls
     sign[walls + 6 + 3] = -1  # z of the baffles' normals
+    sign[walls + 6 + 5 + 3] = -1  # slope of the flow depth along z
     torch.testing.assert_close(b, (a * sign)[:, order], atol=1e-4, rtol=1e-4)
 
 
@@ -112,7 +116,9 @@ def test_step_is_semi_implicit_euler_of_the_denormalised_acceleration(make_model
 def test_output_is_continuous_where_a_point_comes_within_the_radius(
     make_model, make_scene, envelope, jump
 ):
-    model = make_model(dtype=torch.float64, envelope=envelope, relative_velocity=False)
+    model = make_model(
+        dtype=torch.float64, envelope=envelope, relative_velocity=False, depth_range=0.08
+    )
     scene = make_scene()
     base = torch.tensor([[0.3, 0.25, 0.2], [0.33, 0.25, 0.2]], dtype=torch.float64)
 

@@ -18,7 +18,7 @@ from gns_model.training.augment import mirror_positions, mirrored
 from gns_model.training.batches import DRAW, collate, draw, generator, read
 from gns_model.training.distributed import Ranks
 from gns_model.training.feeding import Feeder
-from gns_model.training.loss import step_error, unrolled_loss
+from gns_model.training.loss import FRONT, step_error, unrolled_loss
 from gns_model.training.statistics import measure
 
 SPACING, DT, RADIUS = 0.0625, 0.02, 0.1
@@ -292,6 +292,30 @@ def test_an_error_that_a_scene_shares_weighs_more(free_flight):
     even = torch.where(order == 0, 1.0, -1.0)
     even[2 * (count // 4) * 2 :] = 0.0
     assert cost(even, 1000.0) < 1.2
+
+
+def test_an_error_of_the_front_weighs_more(free_flight):
+    """The same error in as many points: at the front of one of two scenes, and anywhere in it."""
+    net, batch = ballistic(free_flight)
+    history, move = batch.history.clone(), batch.moves[:, 0]
+    history[..., 0] += 1e-4 * torch.arange(len(history))[:, None]  # no two at one place
+    scene = torch.arange(len(history)) % 2
+    scale = DT**2 * net.acceleration_std
+    place = history[:, -1, 0].where(scene == 0, -1.0)
+    count = 1 + int(FRONT * int((scene == 0).sum()))
+    order = place.argsort(descending=True)
+
+    def cost(rows, weight):
+        error = torch.zeros(len(history))
+        error[rows] = 1.0
+        after = history[:, -1] + move + error[:, None] * scale
+        return float(step_error(net, history, after, move, batch=scene, front_weight=weight))
+
+    rear = order[int((scene == 0).sum()) - count : int((scene == 0).sum())]
+    share = count / len(history)
+    assert cost(rear, 8.0) == pytest.approx(share, rel=1e-2, abs=1e-4)
+    # The front's mean error is one in this scene and nothing in the other.
+    assert cost(order[:count], 8.0) == pytest.approx(share + 8 / 2, rel=1e-2)
 
 
 def test_a_drift_is_asked_back(free_flight):

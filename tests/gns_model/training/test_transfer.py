@@ -51,22 +51,31 @@ def test_weights_and_normalisation_are_copied(parent):
 
 
 @pytest.mark.parametrize("types", [0, 9])
-def test_new_material_features_change_nothing_at_first(tmp_path, slides, types):
+@pytest.mark.parametrize(
+    ("more", "new"),
+    [
+        ({"material_features": ("base_friction", "tan_friction_angle")}, 2),
+        ({"depth_range": 0.1}, 4),
+        ({"depth_range": 0.1, "material_features": ("base_friction",)}, 5),
+    ],
+)
+def test_new_features_change_nothing_at_first(tmp_path, slides, types, more, new):
     """Also with a type embedding, whose inputs come after those of the material."""
     given = batch(slides)
     model = build(types=types)
     folder = save_model(tmp_path / "parent", model)
-    child = build(seed=1, types=types, material_features=("base_friction", "tan_friction_angle"))
+    child = build(seed=1, types=types, **more)
     inherit(child, str(folder))
     with torch.no_grad():
         before = model.step(given.history, given.world)
-        torch.testing.assert_close(child.step(given.history, given.world), before, rtol=0, atol=0)
+        after = child.step(given.history, given.world)
+    torch.testing.assert_close(after, before, rtol=0, atol=1e-7)
     # But they can be learned: their weights have gradients.
     child.acceleration(given.history, given.world).square().mean().backward()
     first = child.network.encode_vertex.layers[0].weight
     begin = model.config.vertex_inputs
-    assert (first[:, begin : begin + 2] == 0).all()
-    assert (first.grad[:, begin : begin + 2].abs().sum(0) > 0).all()
+    assert (first[:, begin : begin + new] == 0).all()
+    assert (first.grad[:, begin : begin + new].abs().sum(0) > 0).all()
 
 
 def test_features_that_the_parent_knows_keep_their_weights_in_any_order(tmp_path, slides):
@@ -103,6 +112,9 @@ def test_other_parents_are_refused(parent, tmp_path):
     rich = save_model(tmp_path / "rich", build(material_features=("base_friction",)))
     with pytest.raises(RecipeError, match="it sees base_friction"):
         inherit(build(), str(rich))
+    deep = save_model(tmp_path / "deep", build(depth_range=0.1))
+    with pytest.raises(RecipeError, match=r"its depth_range is 0\.1, the recipe's 0"):
+        inherit(build(), str(deep))
 
 
 def test_training_starts_from_the_parent(tiny, tmp_path):
