@@ -66,7 +66,7 @@ def owed(trials: Sequence[FrozenTrial]) -> list[FrozenTrial]:
         for t in trials
         if RETRY_OF in t.user_attrs and t.user_attrs.get(DROPPED) != TWIN
     }
-    done = [t for t in trials if ORIGIN in t.user_attrs and t.state == TrialState.COMPLETE]
+    done = _given(trials, TrialState.COMPLETE)
     return [
         t
         for t in trials
@@ -74,14 +74,14 @@ def owed(trials: Sequence[FrozenTrial]) -> list[FrozenTrial]:
         and t.user_attrs.get(LOST)
         and t.number not in settled
         and int(t.user_attrs.get(RETRIES, 0)) < MOST_RETRIES
-        and not any(_same_given(t, o) for o in done)
+        and not _among(t, done, trials)
     ]
 
 
 def lost(trials: Sequence[FrozenTrial]) -> list[FrozenTrial]:
     """Those of `owed` that nobody runs just now: to be tried again."""
-    running = [t for t in trials if ORIGIN in t.user_attrs and t.state == TrialState.RUNNING]
-    return [t for t in owed(trials) if not any(_same_given(t, o) for o in running)]
+    running = _given(trials, TrialState.RUNNING)
+    return [t for t in owed(trials) if not _among(t, running, trials)]
 
 
 def surplus(
@@ -135,6 +135,17 @@ def _same(later: FrozenTrial, earlier: FrozenTrial, since: int) -> bool:
         return False
     old = earlier.state == TrialState.COMPLETE and earlier.number < since
     return not (ours[ORIGIN] == "gradient" and old) and _same_place(later, earlier)
+
+
+def _given(trials: Sequence[FrozenTrial], state: TrialState) -> list[FrozenTrial]:
+    return [t for t in trials if ORIGIN in t.user_attrs and t.state == state]
+
+
+def _among(one: FrozenTrial, others: Sequence[FrozenTrial], trials: Sequence[FrozenTrial]) -> bool:
+    """Whether one of `others` is of the layout of a lost trial, as it was given or as it was tried
+    again: what a sampler asked for is made buildable then, and may be what another was made."""
+    again = [t for t in trials if t.user_attrs.get(RETRY_OF) == one.number]
+    return any(_same_given(t, o) for t in (one, *again) for o in others if t.number != o.number)
 
 
 def _same_given(one: FrozenTrial, other: FrozenTrial) -> bool:
