@@ -16,9 +16,9 @@ from collections.abc import Sequence
 from optuna.trial import FrozenTrial, TrialState
 
 #: User attributes of a trial. ORIGIN: where a layout that was given came from; PASSES: what running
-#: it costs; WORKER: who runs it; LOST: its worker left before it was told; RETRY_OF: number of the
-#: lost trial of this layout; RETRIES: how often it was tried again; DROPPED: why it is not run,
-#: TWIN or SURPLUS; RECORD: what it gave.
+#: it costs; WORKER: who was let run it; LOST: its worker left before it was told; RETRY_OF: number
+#: of the lost trial of this layout; RETRIES: how often it was tried again; DROPPED: why it is not
+#: run, TWIN or SURPLUS; RECORD: what it gave.
 ORIGIN, PASSES, WORKER, LOST, RETRY_OF, RETRIES, DROPPED, RECORD = (
     "origin", "passes", "worker", "lost", "retry_of", "retries", "dropped", "record",
 )  # fmt: skip

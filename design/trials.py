@@ -176,10 +176,13 @@ class TrialLog:
         dropped = twins | ledger.surplus(trials, numbers, budget, price)
         for number in dropped:
             trial_id = self._asked[number]
-            why = ledger.TWIN if number in twins else ledger.SURPLUS
-            self.study._storage.set_trial_user_attr(trial_id, ledger.DROPPED, why)
+            self._mark(trial_id, ledger.DROPPED, ledger.TWIN if number in twins else ledger.SURPLUS)
             self._let_go(number)
-        return [None if p.number in dropped else p for p in proposals]
+        admitted = [None if p.number in dropped else p for p in proposals]
+        if self._heart is not None:
+            for proposal in filter(None, admitted):
+                self._mark(self._asked[proposal.number], ledger.WORKER, worker())
+        return admitted
 
     def enqueue(self, origin: str, centres: np.ndarray) -> None:
         """Have `ask` return a layout before the sampler's own, unless it was tried already."""
@@ -198,7 +201,6 @@ class TrialLog:
             self._asked[number] = trial_id
             if self._heart is not None:
                 self._heart.beat_for(trial_id)
-                self.study._storage.set_trial_user_attr(trial_id, ledger.WORKER, worker())
 
     # -- telling -------------------------------------------------------------------------------
 
@@ -329,6 +331,11 @@ class TrialLog:
         if self._heart is not None:
             self._heart.forget(trial_id)
         self._lose(trial_id, False)
+
+    def _mark(self, trial_id: int, name: str, value: object) -> None:
+        """Set a user attribute, unless this worker counts as dead and the trial as failed."""
+        with contextlib.suppress(optuna.exceptions.UpdateFinishedTrialError):
+            self.study._storage.set_trial_user_attr(trial_id, name, value)
 
     def _lose(self, trial_id: int, again: bool) -> None:
         """Fail a trial whose worker is gone; `again`: it has a layout, to be tried again."""
