@@ -217,7 +217,8 @@ def _least_rectangle(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]
             best = float((high - low).prod()), middle, high - low, round(float(yaw), 3)
     assert best is not None
     _, middle, extent, yaw = best
-    if np.hypot(*extent) / 2 * abs(np.radians(yaw)) < TRACE:
+    # The box along the axes that holds it has corners a whole side times the yaw away.
+    if extent.max() * abs(np.radians(yaw)) < TRACE:
         return (points.min(axis=0) + points.max(axis=0)) / 2, np.ptp(points, axis=0), 0.0
     return middle, extent, yaw
 

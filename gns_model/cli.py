@@ -204,6 +204,7 @@ def train(
     """Train a learned simulator."""
     from gns_model.training import Recipe, launch
     from gns_model.training import train as run
+    from gns_model.training.distributed import leave
 
     loaded = Recipe.from_toml(recipe)
     if ranks > 1:
@@ -211,6 +212,7 @@ def train(
     folder = run(loaded, out, resume=resume)
     if os.environ.get("RANK", "0") == "0":
         print(folder)
+    leave()
 
 
 app.command()(evaluate)

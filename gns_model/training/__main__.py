@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 
 from gns_model.console import main
+from gns_model.training.distributed import leave
 from gns_model.training.loop import train
 from gns_model.training.recipe import Recipe
 
@@ -28,6 +29,7 @@ def run(
     path = train(Recipe.from_toml(recipe), out, resume=resume)
     if os.environ.get("RANK", "0") == "0":
         print(path)
+    leave()
 
 
 if __name__ == "__main__":

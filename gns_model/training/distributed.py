@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
@@ -116,3 +117,15 @@ def session(device: str = "auto", threads: int = 1) -> Iterator[Ranks]:
             # Other code of this process expects the arithmetic that it came with.
             torch.set_flush_denormal(False)
             torch.set_num_threads(threads_before)
+
+
+def leave() -> None:
+    """End this process if it is one of several ranks, its work done and its files written.
+
+    Threads of torch's process group can outlive `destroy_process_group`; when the interpreter takes
+    them apart they abort the process (pytorch/pytorch#190489), and `torchrun` calls that a failure.
+    """
+    if int(os.environ.get("WORLD_SIZE", 1)) > 1:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(0)
