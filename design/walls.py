@@ -38,7 +38,7 @@ ROUNDING = 1e-6
 #: As are yaws to this [degrees].
 YAW_ROUNDING = 1e-3
 #: A yaw that moves no corner by more than this is not taken for meant, either [m].
-TRACE = 2e-5
+TRACE = 2.5e-5
 
 
 class WallError(GnsError, ValueError):
