@@ -15,6 +15,7 @@ from design.drawing import layout_drawing, thumbnail
 from design.evaluate import with_walls
 from design.geometry import baffle_mesh, write_geometry
 from design.viewer import _boxes
+from design.walls import TRACE
 from gns_env.layout import LayoutSpace
 from gns_model import footprint
 from gns_model.scene import Scene
