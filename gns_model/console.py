@@ -6,9 +6,11 @@ traceback is kept for our own mistakes. rich and typer are imported when they ar
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import signal
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
@@ -20,6 +22,8 @@ if TYPE_CHECKING:
     from typer import Typer
 
 USER_ERROR, INTERRUPTED = 2, 130
+#: Seconds until an interrupt that Python ignored comes once more.
+AGAIN = 0.1
 
 
 def fail(message: str, code: int = USER_ERROR) -> NoReturn:
@@ -61,7 +65,7 @@ def main(app: Typer, name: str, arguments: list[str] | None = None) -> NoReturn:
     """
     signal.signal(signal.SIGTERM, _interrupt)
     try:
-        with clean_errors():
+        with clean_errors(), _no_interrupt_lost():
             code = _run(app, name, arguments)
             if code == INTERRUPTED:  # typer swallows the interrupt and returns its code
                 raise KeyboardInterrupt
@@ -88,6 +92,29 @@ def _run(app: Typer, name: str, arguments: list[str] | None) -> object:
             print(message, file=sys.stderr)
             raise SystemExit(USER_ERROR) from None
         fail(f"{message} (see {name} --help)")
+
+
+@contextlib.contextmanager
+def _no_interrupt_lost() -> Iterator[None]:
+    """An interrupt that lands in a destructor or in a callback of a weak reference is raised where
+    Python ignores what is raised: it comes again a moment later."""
+    before, timers = sys.unraisablehook, []
+
+    def hook(unraisable: sys.UnraisableHookArgs) -> None:
+        if not issubclass(unraisable.exc_type, KeyboardInterrupt):
+            before(unraisable)
+            return
+        timers.append(threading.Timer(AGAIN, _thread.interrupt_main))
+        timers[-1].daemon = True
+        timers[-1].start()
+
+    sys.unraisablehook = hook
+    try:
+        yield
+    finally:
+        for timer in timers:
+            timer.cancel()
+        sys.unraisablehook = before
 
 
 def _interrupt(signum: int, frame: object) -> NoReturn:

@@ -139,10 +139,12 @@ def test_workers_share_a_budget_and_one_is_killed(storage, method):
     ]
     for process in workers:
         process.start()
-    study, asked, _ = kill_within_a_trial(storage, "test", [workers[0].pid], after=6)
-    for process in workers[1:]:
+    pids = [process.pid for process in workers]
+    study, asked, killed = kill_within_a_trial(storage, "test", pids, after=6)
+    dead = workers.pop(killed)
+    for process in (dead, *workers):
         process.join(300)
-    assert [p.exitcode for p in workers] == [-signal.SIGKILL, 0, 0]
+    assert [p.exitcode for p in (dead, *workers)] == [-signal.SIGKILL, 0, 0]
 
     trials = study.get_trials()
     states = Counter(t.state.name for t in trials)
@@ -175,7 +177,7 @@ def test_workers_share_a_budget_and_one_is_killed(storage, method):
         ]
         (again,) = tried
         assert np.array(again.user_attrs[ledger.RECORD]["centres"]) == layout(t)
-        assert not again.user_attrs[ledger.RECORD]["worker"].endswith(f"-{workers[0].pid}")
+        assert not again.user_attrs[ledger.RECORD]["worker"].endswith(f"-{dead.pid}")
     assert len({r["worker"] for r in records}) >= 2
     given = [
         (t.user_attrs[ledger.ORIGIN], tuple(np.round(sorted(t.params.values()), 5)))
