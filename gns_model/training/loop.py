@@ -31,8 +31,9 @@ from gns_model.training.validation import Scores, Validator
 
 #: Steps with a gradient that is not finite before a run gives up.
 PATIENCE = 20
-#: Steps between two looks for memory to give back to the system.
-TIDY = 50
+#: Steps between two looks for memory to give back to the system: in 50 of the flume a rank grew to
+#: 8 GB, of which it used 2.
+TIDY = 20
 
 
 def train(recipe: Recipe, out: str | os.PathLike[str], *, resume: bool = True) -> Path:
