@@ -131,10 +131,10 @@ def _same(later: FrozenTrial, earlier: FrozenTrial, since: int) -> bool:
     ours, theirs = later.user_attrs, earlier.user_attrs
     if RETRY_OF in ours and ours[RETRY_OF] == theirs.get(RETRY_OF):
         return True
-    if earlier.state == TrialState.FAIL or ours[ORIGIN] != theirs[ORIGIN]:
+    if earlier.state == TrialState.FAIL:
         return False
     old = earlier.state == TrialState.COMPLETE and earlier.number < since
-    return not (ours[ORIGIN] == "gradient" and old) and _same_place(later, earlier)
+    return not (ours[ORIGIN] == "gradient" and old) and _same_given(later, earlier)
 
 
 def _given(trials: Sequence[FrozenTrial], state: TrialState) -> list[FrozenTrial]:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from typer import Typer
 
 USER_ERROR, INTERRUPTED = 2, 130
-#: Seconds until an interrupt that Python ignored comes once more.
+#: Seconds until a signal whose exception Python ignored comes once more.
 AGAIN = 0.1
 
 
@@ -94,19 +94,26 @@ def _run(app: Typer, name: str, arguments: list[str] | None) -> object:
         fail(f"{message} (see {name} --help)")
 
 
+def come_back(seconds: float, number: signal.Signals) -> threading.Timer:
+    """Have a signal come to the main thread in some seconds; the timer, to cancel it by."""
+    timer = threading.Timer(seconds, _thread.interrupt_main, (number,))
+    timer.daemon = True
+    timer.start()
+    return timer
+
+
 @contextlib.contextmanager
 def _no_interrupt_lost() -> Iterator[None]:
     """An interrupt that lands in a destructor or in a callback of a weak reference is raised where
     Python ignores what is raised: it comes again a moment later."""
-    before, timers = sys.unraisablehook, []
+    before = sys.unraisablehook
+    timers: list[threading.Timer] = []
 
     def hook(unraisable: sys.UnraisableHookArgs) -> None:
         if not issubclass(unraisable.exc_type, KeyboardInterrupt):
             before(unraisable)
             return
-        timers.append(threading.Timer(AGAIN, _thread.interrupt_main))
-        timers[-1].daemon = True
-        timers[-1].start()
+        timers.append(come_back(AGAIN, signal.SIGINT))
 
     sys.unraisablehook = hook
     try:

@@ -29,10 +29,10 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from gns_model.errors import FileFormatError, SimulatorError
+from gns_model.files import write_whole
 from gns_model.learned.config import ModelConfig
 from gns_model.learned.model import LearnedModel
 from gns_model.learned.simulator import LearnedSimulator
-from gns_model.scene import write_whole
 
 FORMAT = "gns-model"
 VERSION = 1

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import os
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from gns_model.errors import GnsError
+from gns_model.errors import GnsError, first_fault
+from gns_model.files import write_whole
 from gns_model.learned.config import ModelConfig
 from gns_model.particles import MOVING
-from gns_model.scene import first_fault, toml_text, write_whole
+from gns_model.toml import read_toml, toml_text
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -112,14 +112,7 @@ class Recipe(BaseModel):
         Raises:
             RecipeError: if it is missing, is not TOML or is not a recipe; one line.
         """
-        path = Path(path)
-        try:
-            values = tomllib.loads(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise RecipeError(f"{path}: cannot be read ({error.strerror})") from None
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise RecipeError(f"{path}: not a TOML file ({error})") from None
-        return cls.from_dict(values, source=str(path))
+        return cls.from_dict(read_toml(Path(path), RecipeError), source=str(path))
 
     def to_toml(self, path: str | os.PathLike[str]) -> None:
         """Write the recipe, as `from_toml` reads it; the limits, which training fills in, are not

@@ -7,18 +7,17 @@ has changed nothing yet, and a resumed run takes it again from the same random n
 
 from __future__ import annotations
 
-import _thread
 import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+from gns_model.console import AGAIN, come_back
+
 #: Seconds that a step may still take after the request. Together with the time to save, and with
 #: the single operations that Python cannot interrupt, this stays below the 10 s that we promise.
 GRACE = 4.0
-#: Seconds until a step that was to be given up, and goes on all the same, is given up once more.
-AGAIN = 0.5
 
 
 class Abandoned(BaseException):
@@ -48,9 +47,7 @@ class Stop:
     def _come_back(self, seconds: float) -> None:
         """Come back to the main thread as the same signal would."""
         self.close()
-        self._timer = threading.Timer(seconds, _thread.interrupt_main, (signal.SIGTERM,))
-        self._timer.daemon = True
-        self._timer.start()
+        self._timer = come_back(seconds, signal.SIGTERM)
 
     @contextmanager
     def may_abandon(self) -> Iterator[None]:
