@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import os
 import random
 import time
@@ -18,6 +19,7 @@ from sqlalchemy.exc import ArgumentError, IntegrityError, OperationalError, Prog
 from sqlalchemy.exc import SQLAlchemyError as DatabaseError
 
 from gns_model.errors import GnsError
+from gns_model.interrupts import postponed
 
 #: Signs of life that a worker gives within the time after which it counts as dead.
 BEATS = 4
@@ -31,7 +33,20 @@ class StudyError(GnsError):
     """A study that cannot be opened, or that belongs to another task."""
 
 
-def open_storage(storage: str, grace: int | None) -> optuna.storages.RDBStorage:
+class Storage(optuna.storages.RDBStorage):
+    """An RDBStorage of which an interrupt cuts no transaction in two.
+
+    One that is raised between BEGIN and the line that would roll back leaves a transaction that
+    nobody ends: everybody, its own process too, then waits for its lock.
+    """
+
+
+for _name, _method in vars(optuna.storages.RDBStorage).items():
+    if inspect.isfunction(_method) and not _name.startswith("__"):
+        setattr(Storage, _name, postponed()(_method))
+
+
+def open_storage(storage: str, grace: int | None) -> Storage:
     """The storage at an address, its tables made.
 
     Args:
@@ -53,9 +68,9 @@ def open_storage(storage: str, grace: int | None) -> optuna.storages.RDBStorage:
     address = url.render_as_string(hide_password=False)
     for k in range(TABLE_TRIES):
         try:
-            with warnings.catch_warnings():
+            with warnings.catch_warnings(), postponed():
                 warnings.simplefilter("ignore")  # heartbeats are "experimental" since 2021
-                backend = optuna.storages.RDBStorage(
+                backend = Storage(
                     address,
                     engine_kwargs=options,
                     heartbeat_interval=grace and max(grace // BEATS, 1),

@@ -26,7 +26,8 @@ from design.heart import Heart
 from design.outcome import Outcome, Trial, as_record, from_record
 from design.parameters import distributions, ordered, plan_dim, to_centres, to_parameters
 from design.space import Space
-from design.storage import StudyError, open_storage, public, storage_errors
+from design.storage import Storage, StudyError, open_storage, public, storage_errors
+from gns_model.interrupts import postponed
 
 optuna.logging.set_verbosity(optuna.logging.ERROR)
 
@@ -45,7 +46,7 @@ class TrialLog:
 
     Several workers may hold one study, each with a log of its own. What a worker leaves behind is
     found by the others: at once if it was interrupted, by its missing signs of life if it was
-    killed.
+    killed. An interrupt comes between two trials that are asked for or told, never within one.
     """
 
     def __init__(self, study: optuna.Study, space: Space, heart: Heart | None = None) -> None:
@@ -55,7 +56,7 @@ class TrialLog:
         self._since = len(self._all())
         #: Number of each trial that this log asked for -> its id in the storage.
         self._asked: dict[int, int] = {}
-        self._backend: optuna.storages.RDBStorage | None = None
+        self._backend: Storage | None = None
 
     @classmethod
     def open(
@@ -125,20 +126,26 @@ class TrialLog:
         proposals: list[Proposal] = []
         for _ in range(count):
             try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")  # heartbeats without `Study.optimize`: `Heart`
-                    trial = self.study.ask(self.distributions)
+                trial = self._sample()
             except optuna.exceptions.UpdateFinishedTrialError:
                 # This worker counted as dead while it sampled: that trial is gone.
                 for number in set(self._asked) - {p.number for p in proposals}:
                     self._let_go(number)
                 continue
-            self.hold(trial.number, trial._trial_id)
             centres = self.buildable(to_centres(self.space, trial.params))
             source = trial.user_attrs.get(ledger.ORIGIN, origin)
             proposals.append(Proposal(trial.number, source, centres))
         return proposals
 
+    @postponed()
+    def _sample(self) -> optuna.Trial:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # heartbeats without `Study.optimize`: `Heart`
+            trial = self.study.ask(self.distributions)
+        self.hold(trial.number, trial._trial_id)
+        return trial
+
+    @postponed()
     def reserve(self, layouts: Sequence[tuple[str, np.ndarray]], passes: int = 1) -> list[Proposal]:
         """Given layouts (origin, centres [m]) as trials under way, each of that many passes."""
         proposals = []
@@ -150,6 +157,7 @@ class TrialLog:
             proposals.append(Proposal(number, origin, centres))
         return proposals
 
+    @postponed()
     def again(self, count: int) -> list[Proposal]:
         """At most `count` layouts that other workers, or an earlier run, asked for and left."""
         self._note_the_lost()
@@ -164,6 +172,7 @@ class TrialLog:
             proposals.append(Proposal(trial.number, trial.user_attrs[ledger.ORIGIN], centres))
         return proposals
 
+    @postponed()
     def admit(
         self, proposals: Sequence[Proposal], budget: int, price: int
     ) -> list[Proposal | None]:
@@ -195,6 +204,7 @@ class TrialLog:
             skip_if_exists=True,
         )
 
+    @postponed()
     def hold(self, number: int, trial_id: int) -> None:
         """This log runs that trial: it will tell it or leave it."""
         if number not in self._asked:
@@ -204,6 +214,7 @@ class TrialLog:
 
     # -- telling -------------------------------------------------------------------------------
 
+    @postponed()
     def tell(self, proposal: Proposal, outcome: Outcome) -> Trial:
         """Record what a proposal gave. A failure is told with its finite penalty.
 
@@ -250,6 +261,7 @@ class TrialLog:
         costs = np.array(known)
         return [float(v) for v in 2 * costs.max(axis=0) - costs.min(axis=0)]
 
+    @postponed()
     def abandon(self) -> None:
         """Leave what was asked for and will not be told for others, or a later run, to try."""
         for number, trial_id in list(self._asked.items()):

@@ -10,15 +10,18 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
+import queue
 import signal
 import threading
 import warnings
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from functools import partial
 from typing import Any
 
 from gns_model.errors import SimulatorError
+from gns_model.interrupts import postponed
 
 _THREADS = {
     name: "1"
@@ -26,6 +29,8 @@ _THREADS = {
 }
 _fractions: Any = None  # in a worker: one double a slot, how far the job in it has come
 SLOTS = 256
+#: How often those who wait for jobs look at them [s].
+LOOK = 0.5
 
 
 class WorkerError(SimulatorError):
@@ -36,6 +41,8 @@ class Workers:
     """A pool of one-thread processes whose jobs report how far they are.
 
     Use as a context manager: leaving it ends the processes, at once if by an error or an interrupt.
+    Futures are looked at with interrupts held back: one that lands while it takes a future's lock
+    would leave that locked, and the pool's own thread would wait for it for ever.
     """
 
     def __init__(self, count: int) -> None:
@@ -48,6 +55,7 @@ class Workers:
                 count, mp_context=context, initializer=_start, initargs=(self._fractions,)
             )
 
+    @postponed()
     def submit(self, job: Callable[..., Any], *arguments: Any) -> Job:
         """Queue `job(*arguments, slot)`; a worker calls it with a slot for `report`."""
         slot = self._free.pop(0) if self._free else SLOTS - 1
@@ -78,9 +86,15 @@ class Job:
         self._future, self._fractions, self._slot = future, fractions, slot
 
     @property
+    @postponed()
     def done(self) -> bool:
         """Whether it ended, well or not."""
         return self._future.done()
+
+    @postponed()
+    def when_done(self, call: Callable[[], None]) -> None:
+        """Call that from another thread when it has ended; at once if it has."""
+        self._future.add_done_callback(lambda _: call())
 
     @property
     def fraction(self) -> float:
@@ -93,22 +107,30 @@ class Job:
         Raises:
             WorkerError: if its process died; else whatever the job raised.
         """
+        for _ in as_completed([self]):
+            pass
         try:
-            return self._future.result()
+            with postponed():
+                return self._future.result()
         except BrokenProcessPool:
             raise WorkerError(_DIED) from None
 
 
 def as_completed(jobs: list[Job], watch: Callable[[], None] | None = None) -> Iterator[int]:
     """Indices of `jobs` as they end; `watch` is called twice a second meanwhile."""
-    left = {job._future: k for k, job in enumerate(jobs)}
+    ended: queue.SimpleQueue[int] = queue.SimpleQueue()
+    for k, job in enumerate(jobs):
+        job.when_done(partial(ended.put, k))
+    left = len(jobs)
     while left:
-        # A short wait also lets Ctrl-C through at once.
-        ended, _ = wait(left, timeout=0.5, return_when=FIRST_COMPLETED)
+        ready = None
+        with contextlib.suppress(queue.Empty):
+            ready = ended.get(timeout=LOOK)
         if watch is not None:
             watch()
-        for future in sorted(ended, key=left.__getitem__):
-            yield left.pop(future)
+        if ready is not None:
+            left -= 1
+            yield ready
 
 
 def report(slot: int) -> Callable[[float], None]:

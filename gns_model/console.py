@@ -6,24 +6,21 @@ traceback is kept for our own mistakes. rich and typer are imported when they ar
 
 from __future__ import annotations
 
-import _thread
 import contextlib
 import signal
 import sys
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from gns_model.errors import GnsError
+from gns_model.interrupts import none_lost
 
 if TYPE_CHECKING:
     from rich.progress import Progress
     from typer import Typer
 
 USER_ERROR, INTERRUPTED = 2, 130
-#: Seconds until a signal whose exception Python ignored comes once more.
-AGAIN = 0.1
 
 
 def fail(message: str, code: int = USER_ERROR) -> NoReturn:
@@ -65,7 +62,7 @@ def main(app: Typer, name: str, arguments: list[str] | None = None) -> NoReturn:
     """
     signal.signal(signal.SIGTERM, _interrupt)
     try:
-        with clean_errors(), _no_interrupt_lost():
+        with clean_errors(), none_lost():
             code = _run(app, name, arguments)
             if code == INTERRUPTED:  # typer swallows the interrupt and returns its code
                 raise KeyboardInterrupt
@@ -92,36 +89,6 @@ def _run(app: Typer, name: str, arguments: list[str] | None) -> object:
             print(message, file=sys.stderr)
             raise SystemExit(USER_ERROR) from None
         fail(f"{message} (see {name} --help)")
-
-
-def come_back(seconds: float, number: signal.Signals) -> threading.Timer:
-    """Have a signal come to the main thread in some seconds; the timer, to cancel it by."""
-    timer = threading.Timer(seconds, _thread.interrupt_main, (number,))
-    timer.daemon = True
-    timer.start()
-    return timer
-
-
-@contextlib.contextmanager
-def _no_interrupt_lost() -> Iterator[None]:
-    """An interrupt that lands in a destructor or in a callback of a weak reference is raised where
-    Python ignores what is raised: it comes again a moment later."""
-    before = sys.unraisablehook
-    timers: list[threading.Timer] = []
-
-    def hook(unraisable: sys.UnraisableHookArgs) -> None:
-        if not issubclass(unraisable.exc_type, KeyboardInterrupt):
-            before(unraisable)
-            return
-        timers.append(come_back(AGAIN, signal.SIGINT))
-
-    sys.unraisablehook = hook
-    try:
-        yield
-    finally:
-        for timer in timers:
-            timer.cancel()
-        sys.unraisablehook = before
 
 
 def _interrupt(signum: int, frame: object) -> NoReturn:

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from gns_model.console import AGAIN, come_back
+from gns_model.interrupts import AGAIN, come_back
 
 #: Seconds that a step may still take after the request. Together with the time to save, and with
 #: the single operations that Python cannot interrupt, this stays below the 10 s that we promise.

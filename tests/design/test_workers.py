@@ -8,6 +8,8 @@ import pytest
 from design.workers import WorkerError, Workers, as_completed, report
 from gns_model.errors import SceneError
 
+from .interrupt import Interrupt
+
 
 def double(x, slot):
     return 2 * x, os.environ["OMP_NUM_THREADS"], os.getpid()
@@ -75,3 +77,28 @@ def test_leaving_by_an_interrupt_ends_the_work_at_once():
     with pytest.raises(KeyboardInterrupt):
         work_and_interrupt()
     assert time.monotonic() - started < 60  # and not 200 jobs of 1.5 s
+
+
+def test_an_interrupt_at_any_line_leaves_the_pool_at_work(workers):
+    """It must not take the lock of a future with it, which the pool's own thread needs."""
+
+    def wait_for(job):
+        deadline = time.monotonic() + 60
+
+        def watch():
+            if time.monotonic() > deadline:
+                pytest.fail("the pool no longer works")
+
+        assert list(as_completed([job], watch)) == [0]
+        return job.result()
+
+    line, interrupted = 1, True
+    while interrupted:
+        try:
+            with Interrupt(line):
+                assert wait_for(workers.submit(double, 1))[0] == 2
+            interrupted = False
+        except KeyboardInterrupt:
+            line += 1
+        assert wait_for(workers.submit(double, line))[0] == 2 * line
+    assert line > 100

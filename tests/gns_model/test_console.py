@@ -115,37 +115,3 @@ def test_a_quiet_bar_prints_nothing(capsys):
         bar.advance(bar.add_task("x", total=1))
     captured = capsys.readouterr()
     assert captured.out + captured.err == ""
-
-
-DEAF = """
-import os, signal, time
-import typer
-from gns_model import console
-
-class Deaf:
-    def __del__(self):
-        os.kill(os.getpid(), signal.{signal})
-        for _ in range(1000):  # the interrupt is raised in here, where it is ignored
-            pass
-
-app = typer.Typer()
-
-@app.command()
-def run():
-    Deaf()
-    time.sleep(20)
-    print("nobody heard")
-
-console.main(app, "deaf")
-"""
-
-
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
-def test_an_interrupt_that_a_destructor_swallows_comes_again(name):
-    done = subprocess.run(
-        [sys.executable, "-c", DEAF.format(signal=name)],
-        capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
-    assert done.returncode == 130
-    assert done.stdout == ""
-    assert done.stderr == "error: interrupted; what was finished is kept\n"

@@ -107,6 +107,8 @@ def test_a_stop_in_the_middle_of_a_validation_saves_and_ends(tiny, tmp_path, mon
 
 
 def test_a_stop_before_the_first_step_is_an_interrupt(tiny, tmp_path, monkeypatch):
+    # Cut in the middle of an import, torch would stay half imported for the tests to come.
+    train(Recipe.from_dict({**tiny, "valid": [], "steps": 1}), tmp_path / "first")
     monkeypatch.setattr(stopping, "GRACE", 0.0)
     endless = Recipe.from_dict({**tiny, "statistics_windows": 10**6})
     timer = terminate_after(1.0)
