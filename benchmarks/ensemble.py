@@ -23,7 +23,6 @@ from design.ensemble import Ensemble, beyond_limits, relative_spread
 from design.evaluators import SimulatorSpec
 from design.outcome import Outcome
 from design.store import Pending, Rolled, RolloutStore, Watch
-from design.workers import Workers
 from gns_env.objective import Objective
 from gns_model import measures
 from gns_model.console import print_table, progress_bar
@@ -32,6 +31,7 @@ from gns_model.files import write_whole
 from gns_model.learned.checkpoint import CARD, read_card
 from gns_model.scene import Scene
 from gns_model.trajectory import Trajectory
+from gns_model.workers import Workers
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("--model", default="baffle-lite")

@@ -21,12 +21,12 @@ from design.outcome import Outcome
 from design.risk import MEAN, Flow, Risk, weigh
 from design.rules import FREE, Rules
 from design.space import Space, design_space, split, varies
-from design.workers import Workers, as_completed
 from gns_env.objective import Objective
 from gns_env.task import BaffleTask, simulate
 from gns_model.scene import Scene
 from gns_model.simulator import Progress, Simulator, load_simulator
 from gns_model.trajectory import Trajectory
+from gns_model.workers import Workers, as_completed
 
 
 @dataclass(frozen=True)

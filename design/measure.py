@@ -9,13 +9,13 @@ from typing import Any
 
 from design.evaluators import SimulatorSpec
 from design.store import RolloutStore
-from design.workers import Workers, as_completed, default_count
 from gns_env.objective import Objective
 from gns_model.console import progress_bar
 from gns_model.errors import SimulatorError
 from gns_model.scene import Scene
 from gns_model.trajectory import OK, Trajectory
 from gns_model.vtkhdf import save_vtkhdf
+from gns_model.workers import Workers, as_completed, default_count
 
 
 def measure(

@@ -34,7 +34,7 @@ from gns_model.errors import SimulatorError
 
 if TYPE_CHECKING:
     from design.run import Run
-    from design.workers import Workers
+    from gns_model.workers import Workers
 
 
 @dataclass(frozen=True)

@@ -39,14 +39,18 @@ from design.store import RolloutStore, Watch
 from design.summary import COMPLETE, INTERRUPTED, write_layouts, write_summary, write_trials
 from design.trials import TrialLog
 from design.verify import Judged
-from design.workers import Workers, default_count
 from gns_model.console import progress_bar
 from gns_model.scene import Scene
+from gns_model.workers import Workers, default_count
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
     from design.refine import Continued
+
+
+#: For whoever loses a worker process.
+ADVICE = "go on with --resume and fewer --workers"
 
 
 def optimise(
@@ -75,7 +79,7 @@ def optimise(
         run.open()
         try:
             with progress_bar(quiet=quiet) as bar:
-                with Workers(run.workers) as workers:
+                with Workers(run.workers, advice=ADVICE) as workers:
                     try:
                         run.simulate(workers, bar)
                     except BaseException:

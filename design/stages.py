@@ -24,7 +24,7 @@ from design.summary import PARTIAL
 from design.trials import worker
 from design.verify import Judged, as_judged, rank
 from design.verify import candidates as best_of
-from design.workers import Workers
+from gns_model.workers import Workers
 
 if TYPE_CHECKING:
     from design.run import Run

@@ -19,11 +19,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from design.evaluators import SimulatorSpec
-from design.workers import Job, Workers, as_completed, report
 from gns_model import measures as hard
 from gns_model.errors import GnsError
 from gns_model.files import link_or_copy, write_whole
 from gns_model.scene import Scene
+from gns_model.workers import Job, Workers, as_completed, report
 
 if TYPE_CHECKING:
     from rich.progress import Progress

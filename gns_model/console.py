@@ -41,6 +41,11 @@ def clean_errors() -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         fail("interrupted; what was finished is kept", INTERRUPTED)
+    except SystemError as error:
+        # What C code makes of an interrupt that it did not expect.
+        if not isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):
+            raise
+        fail("interrupted; what was finished is kept", INTERRUPTED)
     except GnsError as error:
         fail(str(error))
     except BrokenPipeError:

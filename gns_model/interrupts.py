@@ -102,3 +102,20 @@ def postponed() -> Iterator[None]:
             raise raised
         for number in arrived:
             signal.raise_signal(number)
+
+
+@contextlib.contextmanager
+def deaf() -> Iterator[None]:
+    """Processes that are started in here do not hear SIGINT, from their first line on: a Ctrl-C in
+    a terminal reaches them too, and whoever started them decides what it means."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    from multiprocessing import resource_tracker
+
+    resource_tracker.ensure_running()  # starting it later would unblock what is blocked
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

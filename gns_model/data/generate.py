@@ -11,16 +11,15 @@ columns. So this makes the paper's dataset of barriers on a GPU machine:
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from pathlib import Path
 
 from gns_model.data.scenes import draw
 from gns_model.errors import FileFormatError, GnsError, SimulatorError
 from gns_model.scene import Scene
 from gns_model.trajectory import open_trajectory
+from gns_model.workers import Workers, as_completed
 
 #: Solvers of `gns_model.mpm`: on a CPU numba is some ten times faster; torch runs on GPUs.
 SOLVERS = ("numba", "torch")
@@ -125,24 +124,14 @@ def _by_processes(
     interval: float,
     report: Callable[[float], None],
 ) -> None:
-    # spawn: a forked process would inherit threads of torch and numba in an unknown state.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, len(todo)), mp_context=context) as pool:
-        jobs = {pool.submit(_make, path, scene, spacing, interval) for path, scene in todo}
-        made = 0
-        try:
-            while jobs:
-                done, jobs = wait(jobs, return_when=FIRST_COMPLETED)
-                for job in done:
-                    job.result()
-                    made += 1
-                    report(made)
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    with Workers(min(workers, len(todo)), advice="a rerun with fewer --workers goes on") as pool:
+        jobs = [pool.submit(_make, path, scene, spacing, interval) for path, scene in todo]
+        for made, k in enumerate(as_completed(jobs), 1):
+            jobs[k].result()
+            report(made)
 
 
-def _make(path: Path, scene: Scene, spacing: float | None, interval: float) -> None:
+def _make(path: Path, scene: Scene, spacing: float | None, interval: float, slot: int = 0) -> None:
     from gns_model.mpm import MpmSimulator
 
     MpmSimulator(spacing=spacing, frame_interval=interval).rollout([scene])[0].save(path)

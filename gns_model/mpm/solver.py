@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import threading
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
 from typing import Any
 
 import numba
 import numpy as np
 
+from gns_model.interrupts import postponed
 from gns_model.mpm.problem import DAMPING_RATE, Discretisation, pose, require_positive
 from gns_model.mpm.transfer import COLUMNS, NODE_COLUMNS, POSITION, advance, advance_serial
 from gns_model.scene import Scene
 from gns_model.simulator import Progress
 from gns_model.trajectory import Trajectory
+from gns_model.workers import Workers, as_completed
 
 # numba's OpenMP layer sets the number of threads of the whole process, torch's included, whose
 # one-thread rollouts then fight for all cores, many times slower. Its own layer leaves torch
@@ -98,21 +98,13 @@ class MpmSimulator:
                 results.append(self._rollout_one(scene, inner))
             return results
         single = {**self.settings(), "workers": 1, "threads": 1}
-        # spawn: a forked process would inherit threads of torch and numba in an unknown state.
-        context = multiprocessing.get_context("spawn")
         done: dict[int, Trajectory] = {}
-        with ProcessPoolExecutor(
-            min(self.workers, len(scenes)), mp_context=context, initializer=_one_thread
-        ) as pool:
-            jobs = {pool.submit(_rollout_job, single, s): n for n, s in enumerate(scenes)}
-            try:
-                for job in as_completed(jobs):
-                    done[jobs[job]] = job.result()
-                    if progress is not None:
-                        progress(len(done) / total)
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
+        with Workers(min(self.workers, len(scenes))) as pool:
+            jobs = [pool.submit(_rollout_job, single, scene) for scene in scenes]
+            for k in as_completed(jobs):
+                done[k] = jobs[k].result()
+                if progress is not None:
+                    progress(len(done) / total)
         return [done[n] for n in range(len(scenes))]
 
     def _rollout_one(self, scene: Scene, progress: Progress | None) -> Trajectory:
@@ -139,16 +131,18 @@ class MpmSimulator:
         threads_before = numba.get_num_threads()
         try:
             for frame in range(1, frames + 1):
-                if threads == 1:
-                    points, ids, spare, spare_ids = advance_serial(
-                        points, ids, spare, spare_ids, *arguments
-                    )
-                else:
-                    with _ONE_CALLER:
-                        numba.set_num_threads(threads)
-                        points, ids, spare, spare_ids = advance(
+                # numba turns an interrupt while it looks for its code into a SystemError.
+                with postponed():
+                    if threads == 1:
+                        points, ids, spare, spare_ids = advance_serial(
                             points, ids, spare, spare_ids, *arguments
                         )
+                    else:
+                        with _ONE_CALLER:
+                            numba.set_num_threads(threads)
+                            points, ids, spare, spare_ids = advance(
+                                points, ids, spare, spare_ids, *arguments
+                            )
                 if not np.abs(points[:, 3:6]).max() < problem.limit:  # False for NaN, too
                     bad_frame = frame
                     break
@@ -161,10 +155,5 @@ class MpmSimulator:
         return problem.trajectory(positions, bad_frame, {**self.settings(), "seconds": seconds})
 
 
-def _one_thread() -> None:
-    os.environ["OMP_NUM_THREADS"] = "1"
-    numba.set_num_threads(1)
-
-
-def _rollout_job(settings: dict[str, Any], scene: Scene) -> Trajectory:
+def _rollout_job(settings: dict[str, Any], scene: Scene, slot: int) -> Trajectory:
     return MpmSimulator(**settings).rollout([scene])[0]

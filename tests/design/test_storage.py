@@ -5,8 +5,7 @@ import sqlite3
 import optuna
 
 from design.storage import open_storage, sqlite_url
-
-from .interrupt import Interrupt
+from tests.interrupt import Interrupt
 
 
 def test_an_interrupt_at_any_line_leaves_no_lock(tmp_path):

@@ -15,6 +15,13 @@ def leave(error: BaseException) -> None:
         raise error
 
 
+def by_c_code() -> SystemError:
+    """What C code makes of an interrupt in Python code that it calls."""
+    error = SystemError("returned a result with an exception set")
+    error.__cause__ = KeyboardInterrupt()
+    return error
+
+
 @pytest.mark.parametrize(
     ("error", "code", "words"),
     [
@@ -23,6 +30,7 @@ def leave(error: BaseException) -> None:
         (OSError("unable to write"), 2, "unable to write"),
         (MemoryError(), 2, "out of memory"),
         (KeyboardInterrupt(), 130, "interrupted"),
+        (by_c_code(), 130, "interrupted"),
     ],
 )
 def test_what_a_user_or_a_machine_causes_is_one_line_and_a_code(capsys, error, code, words):
@@ -38,6 +46,8 @@ def test_what_a_user_or_a_machine_causes_is_one_line_and_a_code(capsys, error, c
 def test_a_fault_of_ours_keeps_its_traceback():
     with pytest.raises(ZeroDivisionError):
         leave(ZeroDivisionError())
+    with pytest.raises(SystemError):
+        leave(SystemError("of C code"))
 
 
 def test_it_decorates_a_command(capsys):

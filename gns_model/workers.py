@@ -1,8 +1,7 @@
-"""Processes of one thread each: how a search and its verification fill a CPU.
+"""Processes of one thread each: how rollouts fill a CPU.
 
-Small matrix products scale badly over threads and well over processes (findings/SPEED.md), and one
-pool for both kinds of work lets the reference solver start while the search goes on. Jobs are plain
-functions of plain arguments; results are small (measures, not positions).
+Small matrix products scale badly over threads and well over processes (findings/SPEED.md). Jobs are
+plain functions of plain arguments, and may tell how far they are.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from functools import partial
 from typing import Any
 
 from gns_model.errors import SimulatorError
-from gns_model.interrupts import postponed
+from gns_model.interrupts import deaf, postponed
 
 _THREADS = {
     name: "1"
@@ -41,18 +40,37 @@ class Workers:
     """A pool of one-thread processes whose jobs report how far they are.
 
     Use as a context manager: leaving it ends the processes, at once if by an error or an interrupt.
+    They are spawned, so a script needs the usual `if __name__ == "__main__":` guard.
+
     Futures are looked at with interrupts held back: one that lands while it takes a future's lock
     would leave that locked, and the pool's own thread would wait for it for ever.
     """
 
-    def __init__(self, count: int) -> None:
+    def __init__(
+        self,
+        count: int,
+        prepare: Callable[..., None] | None = None,
+        *arguments: Any,
+        advice: str = "use fewer of them",
+    ) -> None:
+        """
+        Args:
+            count: of processes; they start when jobs come and then stay.
+            prepare: called in each with `arguments` before its first job.
+            advice: what to do if one dies, in words.
+        """
         self.count = count
+        self.advice = advice
+        # spawn: a forked process would inherit threads of torch and numba in an unknown state.
         context = multiprocessing.get_context("spawn")
         self._fractions = context.Array("d", SLOTS, lock=False)
         self._free = list(range(SLOTS))
         with _environment(_THREADS):
             self._pool = ProcessPoolExecutor(
-                count, mp_context=context, initializer=_start, initargs=(self._fractions,)
+                count,
+                mp_context=context,
+                initializer=_start,
+                initargs=(self._fractions, prepare, arguments),
             )
 
     @postponed()
@@ -61,29 +79,34 @@ class Workers:
         slot = self._free.pop(0) if self._free else SLOTS - 1
         self._fractions[slot] = 0.0
         try:
-            with _environment(_THREADS):  # the pool starts a process when a job needs one
+            with _environment(_THREADS), deaf():  # it starts a process when a job needs one
                 future = self._pool.submit(job, *arguments, slot)
         except BrokenProcessPool:
-            raise WorkerError(_DIED) from None
+            raise WorkerError(_DIED.format(self.advice)) from None
         future.add_done_callback(lambda _: self._free.append(slot))
-        return Job(future, self._fractions, slot)
+        return Job(future, self._fractions, slot, self.advice)
+
+    def end(self) -> None:
+        """End the processes, at once and with whatever they are doing."""
+        for process in list((self._pool._processes or {}).values()):
+            process.terminate()
+        self._pool.shutdown(wait=True, cancel_futures=True)
 
     def __enter__(self) -> Workers:
         return self
 
     def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
-        processes = list((self._pool._processes or {}).values())
         if kind is not None:
-            for process in processes:
-                process.terminate()
-        self._pool.shutdown(wait=True, cancel_futures=True)
+            self.end()
+        self._pool.shutdown(wait=True)
 
 
 class Job:
     """A job under way."""
 
-    def __init__(self, future: Future[Any], fractions: Any, slot: int) -> None:
+    def __init__(self, future: Future[Any], fractions: Any, slot: int, advice: str) -> None:
         self._future, self._fractions, self._slot = future, fractions, slot
+        self._advice = advice
 
     @property
     @postponed()
@@ -113,7 +136,7 @@ class Job:
             with postponed():
                 return self._future.result()
         except BrokenProcessPool:
-            raise WorkerError(_DIED) from None
+            raise WorkerError(_DIED.format(self._advice)) from None
 
 
 def as_completed(jobs: list[Job], watch: Callable[[], None] | None = None) -> Iterator[int]:
@@ -150,13 +173,10 @@ def default_count() -> int:
     return os.cpu_count() or 1
 
 
-_DIED = (
-    "a worker process died (out of memory?): what was finished is kept; go on with --resume and "
-    "fewer --workers"
-)
+_DIED = "a worker process died (out of memory?): what was finished is kept; {}"
 
 
-def _start(fractions: Any) -> None:
+def _start(fractions: Any, prepare: Callable[..., None] | None, arguments: tuple[Any, ...]) -> None:
     global _fractions
     _fractions = fractions
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what an interrupt means
@@ -166,9 +186,8 @@ def _start(fractions: Any) -> None:
         # A parent that was killed takes its workers with it.
         threading.Thread(target=_follow, args=(parent,), daemon=True).start()
     warnings.simplefilter("ignore")  # the parent has checked, and says it once
-    import torch
-
-    torch.set_num_threads(1)
+    if prepare is not None:
+        prepare(*arguments)
 
 
 def _follow(parent: Any) -> None:

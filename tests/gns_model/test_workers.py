@@ -5,10 +5,9 @@ import time
 
 import pytest
 
-from design.workers import WorkerError, Workers, as_completed, report
 from gns_model.errors import SceneError
-
-from .interrupt import Interrupt
+from gns_model.workers import WorkerError, Workers, as_completed, report
+from tests.interrupt import Interrupt
 
 
 def double(x, slot):
@@ -59,8 +58,8 @@ def test_an_error_of_a_job_comes_back_as_it_was(workers):
 
 
 def test_a_process_that_dies_is_one_clear_error():
-    with Workers(1) as pool:
-        with pytest.raises(WorkerError, match="--resume"):
+    with Workers(1, advice="go home") as pool:
+        with pytest.raises(WorkerError, match="go home"):
             pool.submit(die).result()
         with pytest.raises(WorkerError):
             pool.submit(double, 1)
