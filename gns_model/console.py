@@ -74,6 +74,9 @@ def main(app: Typer, name: str, arguments: list[str] | None = None) -> NoReturn:
     finally:
         # Nothing is left to take care of: a signal that comes now must not become a traceback.
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        # Under `python -m`, an interrupt that went through exec (dataclasses use it) would kill us
+        # in the end, in place of the code 130, unless something is evaluated after it.
+        exec("")
     raise SystemExit(code if isinstance(code, int) else 0)
 
 

@@ -125,3 +125,20 @@ def test_a_quiet_bar_prints_nothing(capsys):
         bar.advance(bar.add_task("x", total=1))
     captured = capsys.readouterr()
     assert captured.out + captured.err == ""
+
+
+def test_an_interrupt_within_exec_has_the_same_code(tmp_path):
+    program = """
+import typer
+from gns_model import console
+app = typer.Typer()
+@app.command()
+def run():
+    exec("raise KeyboardInterrupt")
+console.main(app, "tool")
+"""
+    (tmp_path / "tool.py").write_text(program)
+    done = subprocess.run(
+        [sys.executable, "-m", "tool"], cwd=tmp_path, capture_output=True, check=False
+    )
+    assert done.returncode == 130
