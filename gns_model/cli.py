@@ -47,6 +47,7 @@ class Family(StrEnum):
     friction = "friction"
     barriers = "barriers"
     rectangles = "rectangles"
+    squares = "squares"
 
 
 @app.command()

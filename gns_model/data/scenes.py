@@ -9,6 +9,11 @@ The paper's three datasets (table "Training data"), with what its columns and it
                 one or two barriers of 0.1 x 0.3 x 0.1 m
     rectangles  2D: a rectangle at rest against a wall, of random aspect: the paper's validation
 
+one for what the paper's aspect ratios ask of a model that has seen aspect 1 only:
+
+    squares     2D: a square column of 0.08 to 0.45 m at rest, half of them against a wall: as
+                narrow and as high as the columns of other aspects
+
 and three that are made for layouts of baffles in the flume:
 
     random   domain, release (size, place, height of fall, velocity) and one to four baffles of
@@ -49,6 +54,14 @@ def rectangle_scene(rng: np.random.Generator, index: int) -> Scene:
     return _column_box((0.0, 0.0), (length, height), (0.0, 0.0), 30.0)
 
 
+def square_scene(rng: np.random.Generator, index: int) -> Scene:
+    """A scene of the family "squares". The narrow ones collapse in a part of the time."""
+    size = float(np.exp(rng.uniform(np.log(0.08), np.log(0.45))))
+    width = 1.5  # room for the runout of the largest
+    place = 0.0 if rng.random() < 0.5 else rng.uniform(0.0, width - size)
+    return _column_box((place, 0.0), (size, size), (0.0, 0.0), 30.0, width)
+
+
 def _square(rng: np.random.Generator, size: float, friction_angle: float) -> Scene:
     """Half of them are thrown; the other half are columns: at rest on the base, half of those
     against a wall. A column that is let go and a heap that has settled look alike to whoever sees
@@ -68,13 +81,14 @@ def _column_box(
     size: tuple[float, ...],
     velocity: tuple[float, ...],
     friction_angle: float,
+    width: float = 1.0,
 ) -> Scene:
     upper = tuple(a + b for a, b in zip(lower, size, strict=True))
     return Scene.from_dict(
         {
             "name": "column",
             "duration": 1.0,
-            "domain": {"lower": (0.0, 0.0), "upper": (1.0, 1.0)},
+            "domain": {"lower": (0.0, 0.0), "upper": (width, 1.0)},
             "friction": {"base": COLUMN_BASE_FRICTION, "walls": 0.0},
             "material": column_material(friction_angle),
             "release": [{"lower": lower, "upper": upper, "velocity": velocity}],
@@ -191,6 +205,7 @@ FAMILIES: dict[str, Callable[[np.random.Generator, int], Scene]] = {
     "friction": friction_scene,
     "barriers": barrier_scene,
     "rectangles": rectangle_scene,
+    "squares": square_scene,
 }
 
 

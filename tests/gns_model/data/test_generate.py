@@ -1,5 +1,11 @@
 """A dataset is the same whoever makes it, and a rerun goes on where an earlier one stopped."""
 
+import os
+import signal
+import subprocess
+import sys
+import time
+
 import numpy as np
 import pytest
 
@@ -98,3 +104,30 @@ def test_the_command_takes_solver_device_and_batch(tmp_path, capsys):
         code, _, error = run(*wrong)
         assert code == 2
         assert len(error.splitlines()) == 1
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_the_command_at_once_and_keeps_whole_files(tmp_path):
+    """It used to wait for every scene that was queued."""
+    out = tmp_path / "data"
+    command = ["generate", "--family", "squares", "--count", "500", "--workers", "2", "--quiet"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "gns_model.cli", *command, "--out", str(out)],
+        stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    try:
+        deadline = time.monotonic() + 200
+        while not list(out.glob("*.h5")) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        began = time.monotonic()
+        os.killpg(process.pid, signal.SIGINT)  # a terminal tells the workers too
+        _, err = process.communicate(timeout=120)
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+    assert time.monotonic() - began < 30
+    assert process.returncode == 130
+    assert err == "error: interrupted; what was finished is kept\n"
+    paths = list(out.glob("*.h5"))
+    assert 1 <= len(paths) < 500
+    assert all(Trajectory.load(path).status == "ok" for path in paths)
