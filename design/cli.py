@@ -201,7 +201,7 @@ def optimize(
         given = Scene.from_toml(scene)
         from design.objectives import parse
         from design.printed import print_summary
-        from design.run import optimise
+        from design.run import Interrupted, optimise
         from design.scenarios import scenarios_of
         from design.settings import Settings
         from design.variables import placement_of
@@ -247,7 +247,12 @@ def optimize(
             refine_data=refine_data,
         )
         folder = out if out is not None else Path("runs") / given.name
-        summary = optimise(given, folder, settings, command=console.command(), quiet=quiet)
+        try:
+            summary = optimise(given, folder, settings, command=console.command(), quiet=quiet)
+        except Interrupted as left:
+            if not quiet:
+                print_summary(left.summary, folder)
+            raise
         if not quiet:
             print_summary(summary, folder)
 

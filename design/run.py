@@ -73,23 +73,38 @@ def optimise(
     Raises:
         GnsError: for what the user has to change; OSError: for what the machine has to. Whatever
             was finished stands in the run folder then, and `Settings.resume` goes on from it.
+        Interrupted: on Ctrl-C, once there is a report of what there is.
     """
     run = Run(scene, Path(out), settings or Settings(), command)
     with storage_errors(run.storage):
         run.open()
         try:
             with progress_bar(quiet=quiet) as bar:
-                with Workers(run.workers, advice=ADVICE) as workers:
-                    try:
-                        run.simulate(workers, bar)
-                    except BaseException:
-                        with contextlib.suppress(Exception):  # the first error is the one to tell
-                            run.write(INTERRUPTED)
+                try:
+                    with Workers(run.workers, advice=ADVICE) as workers:
+                        try:
+                            run.simulate(workers, bar)
+                        except BaseException:
+                            with contextlib.suppress(Exception):  # the first error is to be told
+                                run.write(INTERRUPTED)
+                            raise
+                except KeyboardInterrupt:
+                    if not run.summary.get("best"):
                         raise
+                    run.publish(bar, INTERRUPTED)  # a second interrupt ends this too
+                    raise Interrupted(run.summary) from None
                 run.publish(bar)
         finally:
             run.close()
     return run.summary
+
+
+class Interrupted(KeyboardInterrupt):
+    """A run that was ended; `summary` is what it had found, as summary.json has it."""
+
+    def __init__(self, summary: dict[str, Any]) -> None:
+        super().__init__()
+        self.summary = summary
 
 
 class Run:
@@ -214,19 +229,19 @@ class Run:
             stages.name_trajectories(self, store, searched, verified)
         self.write(COMPLETE)
 
-    def publish(self, bar: Progress) -> None:
+    def publish(self, bar: Progress, status: str = COMPLETE) -> None:
         """Geometry, figures and report, from what stands in the run folder."""
         from design.geometry import write_geometry
         from design.report import write_report
 
         task = bar.add_task("report", total=1)
         with self.timed("report"):
-            if self.ranked:
-                best = self.problem.built(self.problem.bare, self.ranked[0])
-                write_geometry(best, self.out / "layouts", "best")
+            for best in self._found()[:1]:
+                built = self.problem.built(self.problem.bare, best)
+                write_geometry(built, self.out / "layouts", "best")
             write_report(self.out)
         bar.advance(task)
-        self.write(COMPLETE)
+        self.write(status)
 
     def close(self) -> None:
         """Leave the study and the run folder to others."""
@@ -236,13 +251,17 @@ class Run:
     def write(self, status: str) -> None:
         """summary.json, trials.csv and layouts/ from what there is so far."""
         bare, space = self.problem.bare, self.problem.space
-        ranked = self.ranked or stages.candidates(self, 1)
+        ranked = self._found()
         self.summary = record(self, status, ranked)
         write_summary(self.out, self.summary)
         write_trials(self.out, self.log)
         write_layouts(self.out, bare, space, ranked)
         if self.settings.objectives:
             write_front(self.out, bare, self.summary["front"])
+
+    def _found(self) -> list[Judged]:
+        """The layouts found, best first; while nothing is verified, the search's best."""
+        return self.ranked or stages.candidates(self, 1)
 
     def note(self, line: str) -> None:
         """Put a line on the notes of summary.json, once."""

@@ -167,8 +167,9 @@ def test_ctrl_c_keeps_what_there_is(scene_file, tmp_path):
     out = tmp_path / "run"
     process = subprocess.Popen(
         [*COMMAND, "optimize", str(scene_file), *COARSE, "--budget", "4000", "--batch", "2",
-         "--workers", "1", "--verify", "1", "--out", str(out), "--quiet"],
-        stderr=subprocess.PIPE, text=True, cwd=ROOT, start_new_session=True,
+         "--workers", "1", "--verify", "1", "--out", str(out)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT,
+        start_new_session=True,
     )  # fmt: skip
     try:
         # Ctrl-C of a terminal reaches the whole group, workers too.
@@ -176,16 +177,21 @@ def test_ctrl_c_keeps_what_there_is(scene_file, tmp_path):
         while not _trials(out) and process.poll() is None and time.monotonic() < deadline:
             time.sleep(0.3)
         os.killpg(process.pid, signal.SIGINT)
-        _, err = process.communicate(timeout=120)
+        told, err = process.communicate(timeout=120)
     finally:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
     assert process.returncode == 130
-    assert err == "error: interrupted; what was finished is kept\n"
+    assert err.splitlines()[-1] == "error: interrupted; what was finished is kept"
+    assert "Traceback" not in err
     summary = json.loads((out / "summary.json").read_text())
     assert summary["status"] == "interrupted"
     assert summary["rollouts"] >= 3
     assert (out / "layouts" / "best.toml").exists()
+    # A report of what there is.
+    assert f"{summary['best']['cost']:.4f}" in told
+    assert f"Open {out / 'report.html'}" in told
+    assert "Not verified yet" in (out / "report.html").read_text()
     resumed = subprocess.run(
         [*COMMAND, "optimize", str(scene_file), *COARSE, "--budget", str(summary["rollouts"] + 1),
          "--workers", "1", "--verify", "1", "--out", str(out), "--resume", "--quiet"],
