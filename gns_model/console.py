@@ -39,11 +39,10 @@ def clean_errors() -> Iterator[None]:
     """
     try:
         yield
-    except KeyboardInterrupt:
-        fail("interrupted; what was finished is kept", INTERRUPTED)
-    except SystemError as error:
-        # What C code makes of an interrupt that it did not expect.
-        if not isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):
+    except (KeyboardInterrupt, SystemError) as error:
+        # C code makes a SystemError of an interrupt that it did not expect.
+        cause = error.__cause__ or error.__context__
+        if not isinstance(error, KeyboardInterrupt) and not isinstance(cause, KeyboardInterrupt):
             raise
         fail("interrupted; what was finished is kept", INTERRUPTED)
     except GnsError as error:

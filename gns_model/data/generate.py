@@ -131,7 +131,7 @@ def _by_processes(
             report(made)
 
 
-def _make(path: Path, scene: Scene, spacing: float | None, interval: float, slot: int = 0) -> None:
+def _make(path: Path, scene: Scene, spacing: float | None, interval: float, slot: int) -> None:
     from gns_model.mpm import MpmSimulator
 
     MpmSimulator(spacing=spacing, frame_interval=interval).rollout([scene])[0].save(path)
