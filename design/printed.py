@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from design.trust import trust_lines
+from gns_model.console import show
 from gns_model.measures import UNITS
 
 
@@ -21,10 +22,10 @@ def print_summary(summary: dict[str, Any], folder: Path) -> None:
         for line in lines:
             out.print(line, markup=False, highlight=False)
 
-    out.print(_measures_table(summary))
+    show(_measures_table(summary))
     tell(_layout_lines(summary))
     if summary.get("front"):
-        out.print(_front_table(summary["front"]))
+        show(_front_table(summary["front"]))
     tell(_closing_lines(summary, folder))
 
 
