@@ -48,6 +48,8 @@ class Family(StrEnum):
     barriers = "barriers"
     rectangles = "rectangles"
     squares = "squares"
+    spreading = "spreading"
+    spreading_friction = "spreading-friction"
 
 
 @app.command()

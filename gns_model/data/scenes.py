@@ -9,10 +9,14 @@ The paper's three datasets (table "Training data"), with what its columns and it
                 one or two barriers of 0.1 x 0.3 x 0.1 m
     rectangles  2D: a rectangle at rest against a wall, of random aspect: the paper's validation
 
-one for what the paper's aspect ratios ask of a model that has seen aspect 1 only:
+three for what the paper's aspect ratios ask of a model that has seen aspect 1 only:
 
     squares     2D: a square column of 0.08 to 0.45 m at rest, half of them against a wall: as
                 narrow and as high as the columns of other aspects
+    spreading   2D: a square column of 0.075 to 0.45 m that already spreads as it is let go, or is
+                being pushed together: what a high column is on its way through aspect 1
+    spreading-friction
+                2D: the same at 15, 22.5, 30, 37.5 and 45 degrees in turn, a third of them at rest
 
 and three that are made for layouts of baffles in the flume:
 
@@ -25,6 +29,8 @@ and three that are made for layouts of baffles in the flume:
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -35,6 +41,9 @@ from gns_model.scene import Box, Scene
 
 #: How often a random baffle is drawn again before a scene does with fewer.
 TRIES = 50
+
+#: Boxes along each side of a square of the family "spreading"; a box is whole spacings wide.
+PARTS = 6
 
 
 def column_scene(rng: np.random.Generator, index: int) -> Scene:
@@ -59,7 +68,66 @@ def square_scene(rng: np.random.Generator, index: int) -> Scene:
     size = float(np.exp(rng.uniform(np.log(0.08), np.log(0.45))))
     width = 1.5  # room for the runout of the largest
     place = 0.0 if rng.random() < 0.5 else rng.uniform(0.0, width - size)
-    return _column_box((place, 0.0), (size, size), (0.0, 0.0), 30.0, width)
+    return _column_box(
+        (place, 0.0), (size, size), (0.0, 0.0), 30.0, width, duration=_time_to_rest(size)
+    )
+
+
+def spreading_scene(rng: np.random.Generator, index: int) -> Scene:
+    """A scene of the family "spreading"."""
+    return _spreading(rng, 30.0, at_rest=0.0)
+
+
+def spreading_friction_scene(rng: np.random.Generator, index: int) -> Scene:
+    """A scene of the family "spreading-friction"."""
+    return _spreading(rng, FRICTION_ANGLES[index % len(FRICTION_ANGLES)], at_rest=1 / 3)
+
+
+def _spreading(rng: np.random.Generator, friction_angle: float, *, at_rest: float) -> Scene:
+    """A square column that spreads, but for a share `at_rest`.
+
+    Its velocities are those of the foot of a falling column, free of divergence: with l the
+    distance from the plane that does not move (the wall, or the middle) to the face, and h the
+    height in which the foot spreads,
+
+        u = U (x - x0)/l exp(-y/h),   v = -U h/l (1 - exp(-y/h)),   U up to 1.8 sqrt(g size).
+
+    The release consists of `PARTS` x `PARTS` boxes, each with the velocity of its middle. High
+    columns fall and spread faster than squares at rest ever do, and a model that has seen only
+    those leaves them standing.
+    """
+    size = 0.0125 * PARTS * int(rng.integers(1, 7))
+    width = 2.0
+    at_wall = rng.random() < 0.5
+    place = 0.0 if at_wall else rng.uniform(0.0, width - size)
+    still, length = (place, size) if at_wall else (place + size / 2, size / 2)
+    speed = rng.uniform(-0.6, 1.8) * np.sqrt(9.81 * size)
+    foot = size * np.exp(rng.uniform(np.log(0.4), np.log(3.0)))
+    if rng.random() < at_rest:
+        speed = 0.0
+    corners = size / PARTS * np.arange(PARTS + 1)
+    releases = []
+    for x, right in itertools.pairwise(place + corners):
+        for y, top in itertools.pairwise(corners):
+            fade = np.exp(-(y + top) / 2 / foot)
+            along = speed * ((x + right) / 2 - still) / length * fade
+            down = -speed * foot / length * (1 - fade)
+            releases.append({"lower": (x, y), "upper": (right, top), "velocity": (along, down)})
+    scene = _column_box(
+        (place, 0.0),
+        (size, size),
+        (0.0, 0.0),
+        friction_angle,
+        width,
+        duration=_time_to_rest(size),
+    )
+    return Scene.from_dict({**scene.model_dump(exclude={"releases"}), "release": releases})
+
+
+def _time_to_rest(size: float) -> float:
+    """What a square column of `size` [m] needs to come to rest, and a bit more [s]: later frames
+    would be still ones."""
+    return round(0.2 + 1.5 * math.sqrt(size), 2)
 
 
 def _square(rng: np.random.Generator, size: float, friction_angle: float) -> Scene:
@@ -82,12 +150,13 @@ def _column_box(
     velocity: tuple[float, ...],
     friction_angle: float,
     width: float = 1.0,
+    duration: float = 1.0,
 ) -> Scene:
     upper = tuple(a + b for a, b in zip(lower, size, strict=True))
     return Scene.from_dict(
         {
             "name": "column",
-            "duration": 1.0,
+            "duration": duration,
             "domain": {"lower": (0.0, 0.0), "upper": (width, 1.0)},
             "friction": {"base": COLUMN_BASE_FRICTION, "walls": 0.0},
             "material": column_material(friction_angle),
@@ -206,6 +275,8 @@ FAMILIES: dict[str, Callable[[np.random.Generator, int], Scene]] = {
     "barriers": barrier_scene,
     "rectangles": rectangle_scene,
     "squares": square_scene,
+    "spreading": spreading_scene,
+    "spreading-friction": spreading_friction_scene,
 }
 
 

@@ -110,6 +110,8 @@ class WindowIndex:
         dt: time step of the model [s].
         history: number of velocities that the model sees, H.
         unroll: number of future steps in a window, K.
+        begin: steps of a flow in which no window begins; a rollout leaves them to the solver
+            (`ModelConfig.solver_steps`), so a model need not know them. Not of foreign files.
 
     Raises:
         FileFormatError: for a missing or empty folder, and, naming the file, for one that is
@@ -125,8 +127,10 @@ class WindowIndex:
         dt: float,
         history: int,
         unroll: int = 1,
+        begin: int = 0,
     ) -> None:
         self.spacing, self.dt, self.history, self.unroll = spacing, dt, history, unroll
+        self.begin = begin
         self.sources: list[Source] = []
         self.skipped: list[Path] = []
         for folder in map(Path, folders):
@@ -152,6 +156,7 @@ class WindowIndex:
                 raise FileFormatError(
                     f"{source.path}: {source.frames} frames are too few, {unroll} steps of "
                     f"{dt:g} s need {needed}"
+                    + (f", {begin} steps at the start left out" if begin else "")
                 )
 
     def _stride(self, source: Source) -> int:
@@ -174,7 +179,7 @@ class WindowIndex:
     def first(self, source: int) -> int:
         """The frame of a file that counts as frame 0: a foreign one needs a whole history first."""
         entry = self.sources[source]
-        return self.history * self._stride(entry) if entry.foreign else 0
+        return (self.history if entry.foreign else self.begin) * self._stride(entry)
 
     def read(
         self,

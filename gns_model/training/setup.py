@@ -24,8 +24,11 @@ from gns_model.training.transfer import inherit
 from gns_model.training.validation import Scores
 
 
-def open_data(recipe: Recipe, folders: tuple[str, ...]) -> WindowIndex:
+def open_data(recipe: Recipe, folders: tuple[str, ...], *, begin: int = 0) -> WindowIndex:
     """The windows that `recipe` reads from `folders`, every file checked.
+
+    Args:
+        begin: see `WindowIndex`; to learn from, not to judge rollouts by.
 
     Raises:
         FileFormatError, RecipeError: as `train`.
@@ -36,6 +39,7 @@ def open_data(recipe: Recipe, folders: tuple[str, ...]) -> WindowIndex:
         dt=recipe.model.dt,
         history=recipe.model.history,
         unroll=recipe.unroll,
+        begin=begin,
     )
     if index.dim != recipe.model.dim:
         raise RecipeError(

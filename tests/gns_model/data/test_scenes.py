@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 
 from gns_model.cli import Family
-from gns_model.data.scenes import FAMILIES, draw
+from gns_model.data.scenes import FAMILIES, PARTS, draw
 from gns_model.errors import SceneError
+from gns_model.particles import fill
 
 
 def test_the_command_knows_every_family():
@@ -31,3 +32,31 @@ def test_squares_are_as_narrow_and_as_high_as_columns_of_other_aspects():
     assert (lower[:, 1] == 0).all()
     assert 70 < (lower[:, 0] == 0).sum() < 130
     assert all(scene.releases[0].velocity == (0.0, 0.0) for scene in scenes)
+
+
+@pytest.mark.parametrize("family", ["spreading", "spreading-friction"])
+def test_what_spreads_is_a_square_that_sinks_by_as_much_as_it_widens(family):
+    scenes = [draw(family, 0, k) for k in range(40)]
+    for scene in scenes:
+        lower = np.min([box.lower for box in scene.releases], axis=0)
+        upper = np.max([box.upper for box in scene.releases], axis=0)
+        side = upper[1] - lower[1]
+        assert upper[0] - lower[0] == pytest.approx(side)
+        assert 0.074 < side < 0.451
+        assert lower[1] == 0
+        assert len(fill(scene, 0.0125).positions) == round((side / 0.0125) ** 2)
+
+        velocity = np.array([b.velocity for b in scene.releases]).reshape(PARTS, PARTS, 2)
+        box = side / PARTS
+        widens = np.diff(velocity[..., 0], axis=0)[:, 1:-1] / box
+        sinks = (velocity[:, 2:, 1] - velocity[:, :-2, 1]) / (2 * box)
+        np.testing.assert_allclose(sinks[1:], -widens, rtol=0.03, atol=1e-9)
+        still = velocity[:, :, 0].mean(0) * (lower[0] != 0)
+        np.testing.assert_allclose(still, 0, atol=1e-9)  # free of the wall it spreads both ways
+    assert 10 < sum(scene.releases[0].lower[0] == 0 for scene in scenes) < 30
+
+
+def test_a_third_of_what_spreads_at_five_frictions_is_at_rest():
+    scenes = [draw("spreading-friction", 0, k) for k in range(60)]
+    assert 10 < sum(not any(map(any, (b.velocity for b in s.releases))) for s in scenes) < 30
+    assert {s.material.friction_angle for s in scenes} == {15.0, 22.5, 30.0, 37.5, 45.0}

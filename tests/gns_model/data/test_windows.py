@@ -114,6 +114,17 @@ def test_a_window_is_what_the_file_holds(folder, data):
     assert window.history.dtype == window.future.dtype == np.float32
 
 
+def test_no_window_begins_in_the_steps_that_a_rollout_leaves_to_the_solver(folder):
+    whole, later = index(folder), index(folder, begin=1)
+    assert later.starts(0) == whole.starts(0) - 2
+    for frame in range(later.starts(0)):
+        expected, found = whole.read(0, frame + 2), later.read(0, frame)
+        np.testing.assert_array_equal(found.history, expected.history)
+        np.testing.assert_array_equal(found.future, expected.future)
+    with pytest.raises(FileFormatError, match="need 10, 1 steps at the start left out"):
+        index(folder, unroll=2, begin=1, dt=3 * INTERVAL)
+
+
 def test_frames_outside_are_refused(folder):
     windows = index(folder)
     with pytest.raises(IndexError):

@@ -14,6 +14,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from gns_model.errors import FileFormatError
 from gns_model.learned.checkpoint import load_model
 from gns_model.training import Recipe, RecipeError, TrainingError, train
 from gns_model.training.progress import Display
@@ -63,6 +64,12 @@ def test_training_learns_a_law_of_motion(tiny, tmp_path):
     assert trained["one_step"] < 0.5 * untrained["one_step"]
     assert trained["centroid_travel"] < 0.7 * untrained["centroid_travel"]
     assert trained["diverged"] == 0
+
+
+def test_nothing_is_learned_from_the_steps_that_a_rollout_leaves_to_the_solver(tiny, tmp_path):
+    recipe = Recipe.from_dict({**tiny, "model": {**tiny["model"], "solver_steps": 40}})
+    with pytest.raises(FileFormatError, match="40 steps at the start left out"):
+        train(recipe, tmp_path)
 
 
 def test_the_best_model_is_kept(tiny, tmp_path):
