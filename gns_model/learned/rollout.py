@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -20,6 +20,27 @@ from gns_model.learned.world import World
 from gns_model.particles import Points
 from gns_model.scene import Scene
 from gns_model.simulator import Progress
+
+#: Points in one batch. On a CPU more would only leave the caches: two flumes of 4,048 points at
+#: once cost 10% more than one after the other, four 20% (one thread). A GPU wants to be filled.
+BATCH_POINTS = {"cpu": 6_000, "cuda": 400_000}
+
+
+def groups(sizes: Sequence[int], most: int) -> Iterator[list[int]]:
+    """Consecutive indices whose sizes add up to at most `most`, at least one in each group."""
+    group: list[int] = []
+    for k, size in enumerate(sizes):
+        if group and sum(sizes[j] for j in group) + size > most:
+            yield group
+            group = []
+        group.append(k)
+    if group:
+        yield group
+
+
+def batch_points(device: torch.device) -> int:
+    """Most points of one batch on a device."""
+    return BATCH_POINTS.get(device.type, BATCH_POINTS["cuda"])
 
 
 @torch.inference_mode()

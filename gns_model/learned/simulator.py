@@ -14,21 +14,15 @@ import torch
 from torch import Tensor
 
 from gns_model.errors import SimulatorError
+from gns_model.learned import scope
 from gns_model.learned.model import LearnedModel
 from gns_model.learned.predict import Array, Bounds, predict_positions
-from gns_model.learned.rollout import place, roll_out, roll_out_tensor
-from gns_model.learned.start import Start, frame_count, start
+from gns_model.learned.rollout import batch_points, groups, place, roll_out, roll_out_tensor
+from gns_model.learned.start import Start, frame_count, shifted, start
 from gns_model.particles import MOVING, Points, fill, scatter
 from gns_model.scene import Scene
 from gns_model.simulator import Progress
 from gns_model.trajectory import DIVERGED, OK, Trajectory
-
-#: Points in one batch. On a CPU more would only leave the caches: two flumes of 4,048 points at
-#: once cost 10% more than one after the other, four 20% (one thread). A GPU wants to be filled.
-BATCH_POINTS = {"cpu": 6_000, "cuda": 400_000}
-
-#: Share of the spacing by which a perturbed start displaces the points of a lattice.
-PERTURBATION = 0.05
 
 
 class LearnedSimulator:
@@ -88,24 +82,7 @@ class LearnedSimulator:
             SimulatorError: if the dimension is another.
             SceneError: if a release is thinner than the spacing of the model.
         """
-        if scene.dim != self.config.dim:
-            raise SimulatorError(
-                f"{self.name} is a {self.config.dim}D model and the scene {scene.name!r} is "
-                f"{scene.dim}D"
-            )
-        if scene.baffles and self.config.baffles == "none":
-            raise SimulatorError(
-                f"{self.name} does not see baffles, and the scene {scene.name!r} has "
-                f"{len(scene.baffles)}"
-            )
-        if 0 < self.config.types <= MOVING:
-            raise SimulatorError(
-                f"{self.name} knows particle types 0 to {self.config.types - 1}, and the points of "
-                f"a scene are of type {MOVING}: use predict_positions with types of its own"
-            )
-        for release in scene.releases:
-            if min(release.size) < self.config.spacing:
-                fill(scene, self.config.spacing)  # raises the error that names the release
+        scope.require(self.config, self.name, scene)
         for line in self.config.limits.broken_by(scene):
             limit = line.split(" = ")[0]  # once for each limit, however many scenes pass it
             if limit not in self._warned:
@@ -119,22 +96,9 @@ class LearnedSimulator:
         return scatter(fill(scene, self.config.spacing), self.config.subcells, self.filling)
 
     def perturbed_start(self, scene: Scene, draw: int) -> Tensor:
-        """Displacements [m], shape (N, D), to another start of the same flow, for `noise`.
-
-        Draw 0 is the usual start. A model of mixed tracers starts from another random choice of
-        them (`particles.scatter`); one that starts on a lattice has its points shifted by up to
-        `PERTURBATION` of the spacing.
-        """
-        points = fill(scene, self.config.spacing)
-        if self.config.subcells > 1:
-            usual, other = (
-                scatter(points, self.config.subcells, d).positions
-                for d in (self.filling, self.filling + draw)
-            )
-            shift = other - usual
-        else:
-            most = PERTURBATION * self.config.spacing if draw else 0.0
-            shift = np.random.default_rng(draw).uniform(-most, most, points.positions.shape)
+        """Displacements [m], shape (N, D), to another start of the same flow, for `noise`; draw 0
+        is the usual start. See `start.shifted`."""
+        shift = shifted(scene, self.config.spacing, self.config.subcells, self.filling, draw)
         return torch.from_numpy(shift).to(**place(self.model))
 
     # -- rollouts ------------------------------------------------------------------------------
@@ -164,9 +128,8 @@ class LearnedSimulator:
             for scene, p in zip(scenes, points, strict=True)
         ]
         total, done = max(1, sum(work)), 0.0
-        most = BATCH_POINTS.get(self.device.type, BATCH_POINTS["cuda"])
         trajectories: list[Trajectory] = []
-        for group in groups([len(p.positions) for p in points], most):
+        for group in groups([len(p.positions) for p in points], batch_points(self.device)):
             share = sum(work[k] for k in group)
 
             def advance(fraction: float, done: float = done, share: float = share) -> None:
@@ -396,15 +359,3 @@ class LearnedSimulator:
                 sizes=sizes,
                 yaws=yaws,
             )
-
-
-def groups(sizes: Sequence[int], most: int) -> Iterator[list[int]]:
-    """Consecutive indices whose sizes add up to at most `most`, at least one in each group."""
-    group: list[int] = []
-    for k, size in enumerate(sizes):
-        if group and sum(sizes[j] for j in group) + size > most:
-            yield group
-            group = []
-        group.append(k)
-    if group:
-        yield group

@@ -7,14 +7,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from gns_model.errors import SimulatorError
 from gns_model.learned.config import ModelConfig
 from gns_model.learned.world import baffle_points, baffle_poses
-from gns_model.particles import MOVING, STATIONARY, Points
+from gns_model.particles import MOVING, STATIONARY, Points, fill, scatter
 from gns_model.scene import Scene
+
+#: Share of the spacing by which a perturbed start displaces the points of a lattice.
+PERTURBATION = 0.05
 
 
 @dataclass(frozen=True)
@@ -90,6 +94,22 @@ def start(
             kind = torch.cat([kind, kind.new_full((len(fixed),), STATIONARY)])
         starts.append(Start(history, kind, len(position), before=before))
     return starts
+
+
+def shifted(scene: Scene, spacing: float, subcells: int, filling: int, draw: int) -> np.ndarray:
+    """Displacements [m], shape (N, D), from the usual start of `scene` to another of the same flow.
+
+    Draw 0 is the usual start. A model of mixed tracers starts from another random choice of them
+    (`particles.scatter`); one that starts on a lattice has its points shifted by up to
+    `PERTURBATION` of the spacing.
+    """
+    points = fill(scene, spacing)
+    if subcells > 1:
+        usual, other = (scatter(points, subcells, k).positions for k in (filling, filling + draw))
+        shift: np.ndarray = other - usual
+        return shift
+    most = PERTURBATION * spacing if draw else 0.0
+    return np.random.default_rng(draw).uniform(-most, most, points.positions.shape)
 
 
 def solver_frames(config: ModelConfig, scene: Scene) -> Tensor:

@@ -9,7 +9,8 @@ import torch
 
 from gns_model.learned.config import Limits, ModelConfig
 from gns_model.learned.model import LearnedModel
-from gns_model.learned.simulator import LearnedSimulator, groups
+from gns_model.learned.rollout import groups
+from gns_model.learned.simulator import LearnedSimulator
 from gns_model.particles import fill
 from gns_model.scene import Scene
 from gns_model.simulator import Progress

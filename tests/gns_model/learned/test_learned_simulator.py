@@ -9,7 +9,7 @@ import torch
 
 from gns_model.errors import SimulatorError
 from gns_model.learned import LearnedSimulator, Limits
-from gns_model.learned import simulator as module
+from gns_model.learned import rollout as module
 from gns_model.learned.adjoint import FilterAdjoint, smoothed
 from gns_model.simulator import Simulator
 from gns_model.trajectory import Trajectory
