@@ -259,6 +259,7 @@ def _forward_and_backward(
                 linear_beyond=recipe.linear_beyond,
                 momentum_weight=recipe.momentum_weight,
                 front_weight=recipe.front_weight,
+                scenes_alike=recipe.scenes_alike,
             )
         replay.advanced(after)
     else:
@@ -278,6 +279,7 @@ def _forward_and_backward(
                 linear_beyond=recipe.linear_beyond,
                 momentum_weight=recipe.momentum_weight,
                 front_weight=recipe.front_weight,
+                scenes_alike=recipe.scenes_alike,
                 return_steps=recipe.return_steps,
             )
     run.optimiser.zero_grad(set_to_none=True)

@@ -27,6 +27,7 @@ def step_error(
     linear_beyond: float | None = None,
     momentum_weight: float = 0.0,
     front_weight: float = 0.0,
+    scenes_alike: bool = False,
 ) -> Tensor:
     """Mean square of the normalised acceleration error, a scalar.
 
@@ -48,15 +49,18 @@ def step_error(
             itself, and hardly shows in the mean of squares.
         front_weight: likewise of the mean error of a scene's front (`FRONT`), a twentieth of the
             points that decides the runout, and a twentieth of the mean of squares.
+        scenes_alike: every scene of the batch counts as much as any other, not as many times as it
+            has points: a narrow column is a tenth of a wide one, and its runout as important.
     """
     place, error = history[:, -1, 0], (after - history[:, -1]) - move
     if moving is not None:
         place, error = place[moving], error[moving]
         batch = None if batch is None else batch[moving]
     error = error / (model.config.dt**2 * model.acceleration_std)
-    loss = _penalty(error, linear_beyond).mean()
     if batch is None:
         batch = torch.zeros(len(error), dtype=torch.long, device=error.device)
+    loss = _penalty(error, linear_beyond)
+    loss = _scene_mean(loss, batch).mean() if scenes_alike else loss.mean()
     if momentum_weight:
         mean = _scene_mean(error, batch)
         loss = loss + momentum_weight * _penalty(mean, linear_beyond).mean()
@@ -102,6 +106,7 @@ def unrolled_loss(
     linear_beyond: float | None = None,
     momentum_weight: float = 0.0,
     front_weight: float = 0.0,
+    scenes_alike: bool = False,
     return_steps: float | None = None,
 ) -> Tensor:
     """Loss after the model has taken `steps` steps on its own, a scalar.
@@ -111,7 +116,7 @@ def unrolled_loss(
         backprop: mean of all steps' errors with gradients through all of them. Otherwise
             push-forward (Brandstetter et al. 2022): the first steps only prepare an input with
             the model's own error, and the last one is the loss.
-        linear_beyond, momentum_weight, front_weight: see `step_error`.
+        linear_beyond, momentum_weight, front_weight, scenes_alike: see `step_error`.
         return_steps: with push-forward, also ask for 1/return_steps of the way back: the true
             displacement less that part of how far a point has drifted from the truth. A heap that
             sinks into itself by a hair each step is one-step perfect and a puddle after fifty; so
@@ -129,6 +134,7 @@ def unrolled_loss(
             linear_beyond=linear_beyond,
             momentum_weight=momentum_weight,
             front_weight=front_weight,
+            scenes_alike=scenes_alike,
         )
 
     history = batch.history

@@ -318,6 +318,23 @@ def test_an_error_of_the_front_weighs_more(free_flight):
     assert cost(order[:count], 8.0) == pytest.approx(share + 8 / 2, rel=1e-2)
 
 
+def test_a_small_scene_can_count_as_much_as_a_large_one(free_flight):
+    net, batch = ballistic(free_flight)
+    count = len(batch.history)
+    scene = (torch.arange(count) >= count // 4).long()
+    error = torch.where(scene == 0, 1.0, 0.0)
+    after = batch.history[:, -1] + batch.moves[:, 0]
+    after = after + error[:, None] * DT**2 * net.acceleration_std
+
+    def cost(**options):
+        return float(step_error(net, batch.history, after, batch.moves[:, 0], **options))
+
+    share = count // 4 / count
+    assert cost(batch=scene) == pytest.approx(share, rel=1e-2)
+    assert cost(batch=scene, scenes_alike=True) == pytest.approx(1 / 2, rel=1e-2)
+    assert cost(scenes_alike=True) == pytest.approx(share, rel=1e-2)
+
+
 def test_a_drift_is_asked_back(free_flight):
     """Falling too fast by c: the displacement of the third step is off by 3 c dt², after a drift of
     (1 + 2) c dt². To lose 1/R of that drift, the error to mend is 3 c dt² (1 + 1/R)."""
