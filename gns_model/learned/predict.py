@@ -36,7 +36,7 @@ def predict_positions(
         "dtype": model.velocity_std.dtype,
     }
     torch_in = isinstance(position_sequence, Tensor)
-    history = torch.as_tensor(position_sequence).to(**place)
+    history = torch.as_tensor(position_sequence, **place)
     if history.ndim != 3 or history.shape[1:] != (config.history + 1, config.dim):
         raise SimulatorError(
             f"position_sequence must have shape (N, {config.history + 1}, {config.dim}), "
@@ -46,8 +46,8 @@ def predict_positions(
     world = _world(
         config,
         count,
-        _types(config, particle_type, count).to(place["device"]),
-        _per_point(config, material, count, scene),
+        _types(config, particle_type, count, place["device"]),
+        _per_point(config, material, count, scene, place["device"]),
         scene,
         bounds,
         place,
@@ -59,11 +59,14 @@ def predict_positions(
 
 
 def _types(
-    config: ModelConfig, particle_type: np.ndarray | Tensor | Sequence[int] | None, count: int
+    config: ModelConfig,
+    particle_type: np.ndarray | Tensor | Sequence[int] | None,
+    count: int,
+    device: torch.device,
 ) -> Tensor:
     if particle_type is None:
-        particle_type = torch.full((count,), MOVING)
-    types = torch.as_tensor(particle_type)
+        particle_type = np.full(count, MOVING)
+    types = torch.as_tensor(particle_type, device=device)
     if types.shape != (count,) or types.is_floating_point():
         raise SimulatorError(
             f"particle_type must be integers of shape ({count},), got {types.dtype} of shape "
@@ -83,13 +86,14 @@ def _per_point(
     material: np.ndarray | Tensor | Sequence[float] | float | None,
     count: int,
     scene: Scene | None,
+    device: torch.device,
 ) -> Tensor | None:
     """The material property of every point, checked against what the model sees."""
     features = config.material_features
     if material is not None:
         if "tan_friction_angle" not in features:
             raise SimulatorError("material was given, but the model sees no tan_friction_angle")
-        values = torch.as_tensor(material).float()
+        values = torch.as_tensor(material, device=device).float()
         if values.ndim == 0:
             return values.expand(count)
         if values.numel() != count:

@@ -139,8 +139,9 @@ def launched(config: ModelConfig, begin: Start, points: Points, velocity: Tensor
             "this model leaves its first steps to the reference solver, so nothing can be "
             "differentiated by the velocity of the release"
         )
-    own = torch.tensor(points.velocities).to(begin.history)
+    own = begin.history.new_tensor(points.velocities)
     change = velocity.to(begin.history) - own
-    past = torch.arange(config.history, -1, -1).to(begin.history) * config.dt
+    steps = torch.arange(config.history, -1, -1, device=begin.history.device)
+    past = steps.to(begin.history) * config.dt
     moved = begin.history[: begin.rows] - change[:, None] * past[:, None]
     return replace(begin, history=torch.cat([moved, begin.history[begin.rows :]]))

@@ -162,7 +162,7 @@ def roll_out(
         for p in problems
     ]
     for film, p in zip(films, problems, strict=True):
-        film[0] = torch.tensor(p.start.positions)
+        film[0] = torch.tensor(p.start.positions, device=device)
     most = max(p.frames for p in problems)
     speeds = torch.zeros(len(problems), most + 1, dtype=torch.float64, device=device)
     bad_frames: list[int | None] = [None] * len(problems)
