@@ -50,6 +50,8 @@ class Family(StrEnum):
     squares = "squares"
     spreading = "spreading"
     spreading_friction = "spreading-friction"
+    pressed = "pressed"
+    pressed_friction = "pressed-friction"
 
 
 @app.command()

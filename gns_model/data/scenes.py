@@ -9,7 +9,7 @@ The paper's three datasets (table "Training data"), with what its columns and it
                 one or two barriers of 0.1 x 0.3 x 0.1 m
     rectangles  2D: a rectangle at rest against a wall, of random aspect: the paper's validation
 
-three for what the paper's aspect ratios ask of a model that has seen aspect 1 only:
+and for what the paper's aspect ratios ask of a model that has seen aspect 1 only:
 
     squares     2D: a square column of 0.08 to 0.45 m at rest, half of them against a wall: as
                 narrow and as high as the columns of other aspects
@@ -17,6 +17,10 @@ three for what the paper's aspect ratios ask of a model that has seen aspect 1 o
                 being pushed together: what a high column is on its way through aspect 1
     spreading-friction
                 2D: the same at 15, 22.5, 30, 37.5 and 45 degrees in turn, a third of them at rest
+    pressed     2D: a square column of 0.075 to 0.375 m that is pushed together so fast that it
+                rises into one of aspect 1.5 to 4 before it falls
+    pressed-friction
+                2D: the same at the five angles in turn
 
 and three that are made for layouts of baffles in the flume:
 
@@ -44,6 +48,9 @@ TRIES = 50
 
 #: Boxes along each side of a square of the family "spreading"; a box is whole spacings wide.
 PARTS = 6
+
+#: Width of the box in which squares in motion stand [m].
+WIDE = 2.0
 
 
 def column_scene(rng: np.random.Generator, index: int) -> Scene:
@@ -83,28 +90,74 @@ def spreading_friction_scene(rng: np.random.Generator, index: int) -> Scene:
     return _spreading(rng, FRICTION_ANGLES[index % len(FRICTION_ANGLES)], at_rest=1 / 3)
 
 
+def pressed_scene(rng: np.random.Generator, index: int) -> Scene:
+    """A scene of the family "pressed"."""
+    return _pressed(rng, 30.0)
+
+
+def pressed_friction_scene(rng: np.random.Generator, index: int) -> Scene:
+    """A scene of the family "pressed-friction"."""
+    return _pressed(rng, FRICTION_ANGLES[index % len(FRICTION_ANGLES)])
+
+
+def _pressed(rng: np.random.Generator, friction_angle: float) -> Scene:
+    """A square column that rises as it is pushed together.
+
+    The foot is several times as high as the square, so that it is stretched nearly evenly; speeds
+    are what lifts its top by up to one and a half sizes.
+    """
+    size = 0.0125 * PARTS * int(rng.integers(1, 6))
+    at_wall, place = _stand(rng, size)
+    speed = -rng.uniform(0.8, 1.7) * np.sqrt(9.81 * size) * (1.0 if at_wall else 0.5)
+    foot = size * rng.uniform(2.0, 6.0)
+    duration = 0.3 + _time_to_rest(size)
+    return _in_motion(size, place, at_wall, speed, foot, friction_angle, duration)
+
+
 def _spreading(rng: np.random.Generator, friction_angle: float, *, at_rest: float) -> Scene:
-    """A square column that spreads, but for a share `at_rest`.
-
-    Its velocities are those of the foot of a falling column, free of divergence: with l the
-    distance from the plane that does not move (the wall, or the middle) to the face, and h the
-    height in which the foot spreads,
-
-        u = U (x - x0)/l exp(-y/h),   v = -U h/l (1 - exp(-y/h)),   U up to 1.8 sqrt(g size).
-
-    The release consists of `PARTS` x `PARTS` boxes, each with the velocity of its middle. High
-    columns fall and spread faster than squares at rest ever do, and a model that has seen only
-    those leaves them standing.
+    """A square column whose foot spreads, but for a share `at_rest`. High columns fall and spread
+    faster than squares at rest ever do, and a model that has seen only those leaves them standing.
     """
     size = 0.0125 * PARTS * int(rng.integers(1, 7))
-    width = 2.0
-    at_wall = rng.random() < 0.5
-    place = 0.0 if at_wall else rng.uniform(0.0, width - size)
-    still, length = (place, size) if at_wall else (place + size / 2, size / 2)
+    at_wall, place = _stand(rng, size)
     speed = rng.uniform(-0.6, 1.8) * np.sqrt(9.81 * size)
     foot = size * np.exp(rng.uniform(np.log(0.4), np.log(3.0)))
     if rng.random() < at_rest:
         speed = 0.0
+    return _in_motion(size, place, at_wall, speed, foot, friction_angle, _time_to_rest(size))
+
+
+def _stand(rng: np.random.Generator, size: float) -> tuple[bool, float]:
+    """Whether a square stands against the wall, as half of them do, and where its left face is."""
+    at_wall = bool(rng.random() < 0.5)
+    return at_wall, 0.0 if at_wall else rng.uniform(0.0, WIDE - size)
+
+
+def _in_motion(
+    size: float,
+    place: float,
+    at_wall: bool,
+    speed: float,
+    foot: float,
+    friction_angle: float,
+    duration: float,
+) -> Scene:
+    """A square column with the velocities of the foot of a falling one, free of divergence.
+
+    With l the distance from the plane that does not move (the wall, or the middle) to the face, and
+    h the height of the foot,
+
+        u = U (x - x0)/l exp(-y/h),   v = -U h/l (1 - exp(-y/h)).
+
+    The release consists of `PARTS` x `PARTS` boxes, each with the velocity of its middle.
+
+    Args:
+        size: of the square [m].
+        place: of its left face [m].
+        speed: U, of the foot of the face; negative: inwards [m/s].
+        foot: h [m].
+    """
+    still, length = (place, size) if at_wall else (place + size / 2, size / 2)
     corners = size / PARTS * np.arange(PARTS + 1)
     releases = []
     for x, right in itertools.pairwise(place + corners):
@@ -114,12 +167,7 @@ def _spreading(rng: np.random.Generator, friction_angle: float, *, at_rest: floa
             down = -speed * foot / length * (1 - fade)
             releases.append({"lower": (x, y), "upper": (right, top), "velocity": (along, down)})
     scene = _column_box(
-        (place, 0.0),
-        (size, size),
-        (0.0, 0.0),
-        friction_angle,
-        width,
-        duration=_time_to_rest(size),
+        (place, 0.0), (size, size), (0.0, 0.0), friction_angle, WIDE, duration=duration
     )
     return Scene.from_dict({**scene.model_dump(exclude={"releases"}), "release": releases})
 
@@ -277,6 +325,8 @@ FAMILIES: dict[str, Callable[[np.random.Generator, int], Scene]] = {
     "squares": square_scene,
     "spreading": spreading_scene,
     "spreading-friction": spreading_friction_scene,
+    "pressed": pressed_scene,
+    "pressed-friction": pressed_friction_scene,
 }
 
 

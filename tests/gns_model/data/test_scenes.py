@@ -34,7 +34,7 @@ def test_squares_are_as_narrow_and_as_high_as_columns_of_other_aspects():
     assert all(scene.releases[0].velocity == (0.0, 0.0) for scene in scenes)
 
 
-@pytest.mark.parametrize("family", ["spreading", "spreading-friction"])
+@pytest.mark.parametrize("family", ["spreading", "spreading-friction", "pressed"])
 def test_what_spreads_is_a_square_that_sinks_by_as_much_as_it_widens(family):
     scenes = [draw(family, 0, k) for k in range(40)]
     for scene in scenes:
@@ -54,6 +54,17 @@ def test_what_spreads_is_a_square_that_sinks_by_as_much_as_it_widens(family):
         still = velocity[:, :, 0].mean(0) * (lower[0] != 0)
         np.testing.assert_allclose(still, 0, atol=1e-9)  # free of the wall it spreads both ways
     assert 10 < sum(scene.releases[0].lower[0] == 0 for scene in scenes) < 30
+
+
+def test_what_is_pressed_rises_to_heights_of_high_columns():
+    rises = []
+    for scene in (draw("pressed", 0, k) for k in range(40)):
+        size = max(box.upper[1] for box in scene.releases)
+        top = max(box.velocity[1] for box in scene.releases)
+        rises.append(top**2 / (2 * 9.81) / size)
+        assert all(box.velocity[1] > 0 for box in scene.releases)
+    assert 0.15 < min(rises) < 0.5
+    assert 1.0 < max(rises) < 1.5
 
 
 def test_a_third_of_what_spreads_at_five_frictions_is_at_rest():
