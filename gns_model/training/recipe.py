@@ -76,7 +76,8 @@ class Recipe(BaseModel):
     #: Steps in which the unrolled phase asks the model to make up for its drift; see `loss`.
     return_steps: Annotated[float, Field(ge=1, allow_inf_nan=False)] | None = None
     #: Flows that each rank keeps rolling by the model itself in the unrolled phase, in place of K
-    #: steps for every window, and the most steps of one; see `replay`. 0: none.
+    #: steps for every window, and the most steps of one; few more than a batch holds, or the model
+    #: learns late what it does wrong. See `replay`. 0: none.
     replay: Annotated[int, Field(ge=0)] = 0
     replay_steps: Count = 40
     #: Share of the steps that are about them; the others look at true states and keep them right.

@@ -13,6 +13,10 @@ damped: with e(t) = x - x_true of a point and tau = `return_steps` dt,
 
 Asking for the true place in the next step instead would ask for accelerations of e/dt², which are
 tens of g for the wanderings of single grains that nobody can foretell.
+
+The way back closes a control loop, and the pool is its delay: what the weights of now do wrong
+shows at the end of a flow, after `replay_steps` turns of that flow. So keep few flows, about as
+many as a batch holds.
 """
 
 from __future__ import annotations
@@ -161,7 +165,7 @@ class Replay:
         except (OSError, SafetensorError, KeyError, TypeError, ValueError):
             return
         if all(self._known(f) for f in flows):
-            self.flows, self.drawn = flows, drawn
+            self.flows, self.drawn = flows[: self._recipe.replay], drawn
 
     def _known(self, flow: Rolling) -> bool:
         source = flow.draw.source

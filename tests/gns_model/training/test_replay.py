@@ -155,6 +155,18 @@ def test_a_file_keeps_the_flows_of_its_step_only(flight, tmp_path):
     assert restored(3).flows == []
 
 
+def test_a_recipe_with_fewer_flows_goes_on_with_the_first_of_them(flight, tmp_path):
+    replay, net = started(flight), flight[3]
+    advance(replay, net, 0)
+    replay.keep()
+    replay.save(tmp_path, 1)
+    recipe, data, statistics, _ = flight
+    with session("cpu") as ranks:
+        other = Replay(data, recipe.model_copy(update={"replay": 2}), statistics, ranks)
+    other.restore(tmp_path, 1)
+    assert [f.draw for f in other.flows] == [f.draw for f in replay.flows[:2]]
+
+
 def test_replay_needs_a_way_back(tiny):
     with pytest.raises(RecipeError, match="return_steps"):
         Recipe.from_dict({**tiny, "replay": 4})
