@@ -260,6 +260,7 @@ def _forward_and_backward(
                 momentum_weight=recipe.momentum_weight,
                 front_weight=recipe.front_weight,
                 scenes_alike=recipe.scenes_alike,
+                relative_to=recipe.relative_to,
             )
         replay.advanced(after)
     else:
@@ -280,6 +281,7 @@ def _forward_and_backward(
                 momentum_weight=recipe.momentum_weight,
                 front_weight=recipe.front_weight,
                 scenes_alike=recipe.scenes_alike,
+                relative_to=recipe.relative_to,
                 return_steps=recipe.return_steps,
             )
     run.optimiser.zero_grad(set_to_none=True)

@@ -28,6 +28,7 @@ def step_error(
     momentum_weight: float = 0.0,
     front_weight: float = 0.0,
     scenes_alike: bool = False,
+    relative_to: float | None = None,
 ) -> Tensor:
     """Mean square of the normalised acceleration error, a scalar.
 
@@ -51,14 +52,23 @@ def step_error(
             points that decides the runout, and a twentieth of the mean of squares.
         scenes_alike: every scene of the batch counts as much as any other, not as many times as it
             has points: a narrow column is a tenth of a wide one, and its runout as important.
+        relative_to: an acceleration q [standard deviations]. Errors are divided by
+            sqrt(s² + q²), s the root mean square of what `move` asks of the scene. A scene in
+            violent motion has large errors for a few steps, and a slow one small errors for so many
+            that they decide where it stops.
     """
     place, error = history[:, -1, 0], (after - history[:, -1]) - move
+    asked = move - (history[:, -1] - history[:, -2])
     if moving is not None:
-        place, error = place[moving], error[moving]
+        place, error, asked = place[moving], error[moving], asked[moving]
         batch = None if batch is None else batch[moving]
-    error = error / (model.config.dt**2 * model.acceleration_std)
     if batch is None:
         batch = torch.zeros(len(error), dtype=torch.long, device=error.device)
+    unit = model.config.dt**2 * model.acceleration_std
+    error = error / unit
+    if relative_to is not None:
+        strong = _scene_mean((asked / unit).square(), batch).mean(1, keepdim=True)
+        error = error / (strong + relative_to**2).sqrt()[batch]
     loss = _penalty(error, linear_beyond)
     loss = _scene_mean(loss, batch).mean() if scenes_alike else loss.mean()
     if momentum_weight:
@@ -107,6 +117,7 @@ def unrolled_loss(
     momentum_weight: float = 0.0,
     front_weight: float = 0.0,
     scenes_alike: bool = False,
+    relative_to: float | None = None,
     return_steps: float | None = None,
 ) -> Tensor:
     """Loss after the model has taken `steps` steps on its own, a scalar.
@@ -116,7 +127,7 @@ def unrolled_loss(
         backprop: mean of all steps' errors with gradients through all of them. Otherwise
             push-forward (Brandstetter et al. 2022): the first steps only prepare an input with
             the model's own error, and the last one is the loss.
-        linear_beyond, momentum_weight, front_weight, scenes_alike: see `step_error`.
+        linear_beyond, momentum_weight, front_weight, scenes_alike, relative_to: see `step_error`.
         return_steps: with push-forward, also ask for 1/return_steps of the way back: the true
             displacement less that part of how far a point has drifted from the truth. A heap that
             sinks into itself by a hair each step is one-step perfect and a puddle after fifty; so
@@ -135,6 +146,7 @@ def unrolled_loss(
             momentum_weight=momentum_weight,
             front_weight=front_weight,
             scenes_alike=scenes_alike,
+            relative_to=relative_to,
         )
 
     history = batch.history

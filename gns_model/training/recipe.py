@@ -63,6 +63,8 @@ class Recipe(BaseModel):
     #: Weight of the error that all points of a scene share; see `loss.step_error`.
     momentum_weight: NonNegative = 0.0
     front_weight: NonNegative = 0.0  #: likewise of the front of a scene
+    #: Errors count relative to what accelerates their scene, this much more [standard deviations].
+    relative_to: Positive | None = None
     scenes_alike: bool = False  #: every scene of a batch counts the same, however many its points
     early: Fraction = 0.0  #: share of windows from the first `early_steps` steps of a rollout
     early_steps: Count = 8  #: 0.16 s at a stride of 0.02 s: a release turns into a flow

@@ -335,6 +335,27 @@ def test_a_small_scene_can_count_as_much_as_a_large_one(free_flight):
     assert cost(scenes_alike=True) == pytest.approx(share, rel=1e-2)
 
 
+def test_errors_count_relative_to_what_accelerates_the_scene(free_flight):
+    """Two scenes with the same error: nothing happens in one, and the other brakes at 3 deviations;
+    with q = 4 they count (1/4)² and (1/5)²."""
+    net, batch = ballistic(free_flight)
+    count = len(batch.history)
+    scene = (torch.arange(count) >= count // 2).long()
+    unit = DT**2 * net.acceleration_std
+    now, before = batch.history[:, -1], batch.history[:, -2]
+    move = now - before - 3.0 * unit * scene[:, None]
+
+    def cost(error, **options):
+        after = now + move + error * unit
+        return float(step_error(net, batch.history, after, move, batch=scene, **options))
+
+    assert cost(1.0) == pytest.approx(1.0, rel=1e-2)
+    expected = (1 / 16 + 1 / 25) / 2
+    assert cost(1.0, relative_to=4.0, scenes_alike=True) == pytest.approx(expected, rel=1e-2)
+    alone = cost(1.0, relative_to=4.0, scenes_alike=True, momentum_weight=1.0)
+    assert alone == pytest.approx(2 * expected, rel=1e-2)
+
+
 def test_a_drift_is_asked_back(free_flight):
     """Falling too fast by c: the displacement of the third step is off by 3 c dt², after a drift of
     (1 + 2) c dt². To lose 1/R of that drift, the error to mend is 3 c dt² (1 + 1/R)."""
