@@ -27,6 +27,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from gns_model.data import halves
 from gns_model.errors import FileFormatError, SceneError
 from gns_model.particles import MOVING, STATIONARY, fill
 from gns_model.scene import Scene
@@ -81,6 +82,7 @@ class Source:
     foreign: bool = False  #: imported: its points are not those of its scene
     particle_type: np.ndarray | None = None  #: of foreign points, shape (N,) int8
     tan_friction: np.ndarray | None = None  #: of foreign points, shape (N,), if it is known
+    plane: float | None = None  #: see `halves.plane_of_symmetry`
 
     def points(self, residue: int) -> int:
         """Number of points in a tracer set."""
@@ -189,6 +191,7 @@ class WindowIndex:
         *,
         mixture: int | None = None,
         unroll: int | None = None,
+        half: bool = False,
     ) -> Window:
         """Read one window; only the frames that it needs leave the disk.
 
@@ -198,6 +201,7 @@ class WindowIndex:
             residue: which tracer set, 0 to `residues(source) - 1`.
             mixture: seed of a mixture of the tracer sets, in place of one of them.
             unroll: number of future steps if it is not the index's.
+            half: only what lies right of the plane of symmetry, which becomes a wall; see `halves`.
 
         Raises:
             FileFormatError: if the file has become unreadable since it was indexed.
@@ -216,6 +220,10 @@ class WindowIndex:
         try:
             with open_trajectory(entry.path) as file:
                 positions = file["positions"]
+                if half:
+                    assert entry.plane is not None
+                    chosen = chosen[positions[0][chosen][:, 0] > entry.plane]
+                    out = out[: len(chosen)]
                 for k in np.flatnonzero(frames >= 0):
                     out[:, k] = positions[frames[k]][chosen]
                 if frames[0] < 0:
@@ -227,12 +235,17 @@ class WindowIndex:
             if isinstance(error, FileFormatError):
                 raise
             raise FileFormatError(f"{entry.path}: unreadable at frame {frame} ({error})") from None
+        scene = entry.scene
+        if half and entry.plane is not None:
+            # Points next to the plane may pass it by a hair, in turn with their mirror images.
+            out[..., 0] = entry.plane + np.abs(out[..., 0] - np.float32(entry.plane))
+            scene = halves.half(scene, entry.plane)
         split = self.history + 1
         kinds, friction = entry.particle_type, entry.tan_friction
         return Window(
             out[:, :split],
             out[:, split:],
-            entry.scene,
+            scene,
             particle_type=None if kinds is None else kinds[chosen].astype(np.int64),  # type: ignore[arg-type]
             tan_friction=None if friction is None else friction[chosen],  # type: ignore[arg-type]
         )
@@ -312,6 +325,7 @@ def read_source(path: Path, *, spacing: float) -> Source | None:
         residue=residue.astype(np.uint8),
         cell=cell.astype(np.int32),
         counts=counts,
+        plane=halves.plane_of_symmetry(scene),
     )
 
 

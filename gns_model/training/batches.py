@@ -34,6 +34,7 @@ class Draw:
     mixture: int  #: seed of the choice of tracers
     mirror: bool
     edges: float  #: that it will have, about
+    half: bool = False  #: of a symmetric flow, against a wall in its middle
 
 
 @dataclass(frozen=True)
@@ -69,12 +70,15 @@ def draw(
     early: float = 0.0,
     early_steps: int = 8,
     unroll: int = 1,
+    halves: bool = False,
 ) -> list[list[Draw]]:
     """The windows of one step for every rank, so that all have about `edges_per_batch` edges.
 
     Trajectories, frames and tracers are drawn uniformly, but for a share `early` of the windows
     that come from the first `early_steps` steps of a rollout: a release collapses within a few
     steps, every later step inherits what goes wrong there, and uniform draws hardly ever show it.
+
+    With `halves`, every other window of a symmetric flow is half of it, against a wall.
 
     Every rank calls this with the same generator and takes its own part. The largest windows are
     dealt first, each to the rank that has the least, so that no rank waits long for another.
@@ -92,10 +96,11 @@ def draw(
         mixture = int(rng.integers(2**31))
         flip = bool(rng.integers(2)) and mirror
         points = len(index.sources[source].residue) // index.residues(source)
-        edges = statistics.edges(points, (frame + 0.5) / starts)
+        half = halves and index.sources[source].plane is not None and rng.random() < 0.5
+        edges = statistics.edges(points, (frame + 0.5) / starts) / (2 if half else 1)
         if len(draws) >= ranks and total + edges / 2 > ranks * edges_per_batch:
             break
-        draws.append(Draw(source, frame, mixture, flip, edges))
+        draws.append(Draw(source, frame, mixture, flip, edges, half))
         total += edges
     parts: list[list[Draw]] = [[] for _ in range(ranks)]
     for item in sorted(draws, key=lambda d: -d.edges):
@@ -106,13 +111,15 @@ def draw(
 def read(
     index: WindowIndex, item: Draw, *, unroll: int = 1, kinematic: float | None = None
 ) -> Window:
-    """Read what was drawn, mirrored if so drawn.
+    """Read what was drawn, halved and mirrored if so drawn.
 
     Args:
         unroll: number of future steps.
         kinematic: see `kinematic.kinematic_spacing`.
     """
-    window = index.read(item.source, item.frame, mixture=item.mixture, unroll=unroll)
+    window = index.read(
+        item.source, item.frame, mixture=item.mixture, unroll=unroll, half=item.half
+    )
     if item.mirror:
         window = replace(
             window,

@@ -70,6 +70,7 @@ class Feeder:
             mirror=recipe.mirror,
             early=recipe.early,
             early_steps=recipe.early_steps,
+            halves=recipe.halves,
             unroll=unroll,
         )[self._ranks.rank]
         kinematic = kinematic_spacing(recipe.model)

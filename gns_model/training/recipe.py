@@ -71,6 +71,8 @@ class Recipe(BaseModel):
     clip_norm: Positive = 1.0  #: of the whole gradient
     ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.999
     mirror: bool = True  #: show every other window in a mirror (`augment`)
+    #: Show every other window of a symmetric 2D flow as half of it against a wall (`data.halves`).
+    halves: bool = False
     statistics_windows: Count = 256  #: windows that the normalisation is measured on
 
     unroll: Count = 1  #: steps K of the unrolled phase

@@ -188,6 +188,7 @@ class Replay:
             mirror=recipe.mirror,
             early=recipe.early,
             early_steps=recipe.early_steps,
+            halves=recipe.halves,
         )
         return Rolling(draw, int(rng.integers(1, recipe.replay_steps + 1)))
 
