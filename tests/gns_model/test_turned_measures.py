@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gns_model import footprint, measures
@@ -92,14 +92,15 @@ def test_overtopping_and_insides_follow_the_footprint(flume, trajectory_of):
 
 
 @settings(max_examples=5)
+@example(21, 0.0, 0.0)  # of 6,000 points the window holds too few for a quantile
 @given(st.integers(0, 1000), st.floats(-80, 80), st.floats(-80, 80))
 def test_smooth_becomes_hard_as_the_temperature_falls(flume, trajectory_of, seed, one, other):
     scene = scene_of(flume, one, other)
-    cloud = cloud_of(scene, seed, 1, 6000)
+    cloud = cloud_of(scene, seed, 1, 30_000)
     centres, sizes, yaws = tensors(scene)
-    hard = measures.summary(trajectory_of(cloud.numpy(), scene, point_volume=VOLUME / 10))
+    hard = measures.summary(trajectory_of(cloud.numpy(), scene, point_volume=VOLUME / 50))
     smooth = smooth_measures(
-        cloud, scene, centres, sizes, yaws=yaws, temperature=1e-6, point_volume=VOLUME / 10
+        cloud, scene, centres, sizes, yaws=yaws, temperature=1e-6, point_volume=VOLUME / 50
     )
     assert float(smooth["upstream_depth"]) == pytest.approx(hard["upstream_depth"], rel=0.1)
 
