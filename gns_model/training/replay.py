@@ -169,7 +169,10 @@ class Replay:
 
     def _known(self, flow: Rolling) -> bool:
         source = flow.draw.source
-        return source < len(self._data.sources) and flow.draw.frame < self._data.starts(source, 1)
+        if source >= len(self._data.sources):
+            return False
+        halved = flow.draw.half and self._data.sources[source].plane is None
+        return not halved and flow.draw.frame < self._data.starts(source, 1)
 
     @property
     def _file(self) -> str:
