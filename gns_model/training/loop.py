@@ -19,7 +19,7 @@ from gns_model.training.distributed import RankError, Ranks, session
 from gns_model.training.feeding import Feeder
 from gns_model.training.heap import release_heap
 from gns_model.training.launching import end_with_launcher
-from gns_model.training.loss import step_error, unrolled_loss
+from gns_model.training.loss import Emphasis, step_error, unrolled_loss
 from gns_model.training.progress import Display
 from gns_model.training.recipe import Recipe
 from gns_model.training.replay import Replay
@@ -254,13 +254,9 @@ def _forward_and_backward(
                 batch.history,
                 after,
                 batch.moves[:, 0],
+                Emphasis.of(recipe),
                 batch=batch.world.batch,
                 moving=batch.moving,
-                linear_beyond=recipe.linear_beyond,
-                momentum_weight=recipe.momentum_weight,
-                front_weight=recipe.front_weight,
-                scenes_alike=recipe.scenes_alike,
-                relative_to=recipe.relative_to,
             )
         replay.advanced(after)
     else:
@@ -275,13 +271,9 @@ def _forward_and_backward(
             loss = unrolled_loss(
                 run.model,
                 batch,
+                Emphasis.of(recipe),
                 steps=feeder.unroll(step, progress),
                 backprop=recipe.backprop_through_unroll,
-                linear_beyond=recipe.linear_beyond,
-                momentum_weight=recipe.momentum_weight,
-                front_weight=recipe.front_weight,
-                scenes_alike=recipe.scenes_alike,
-                relative_to=recipe.relative_to,
                 return_steps=recipe.return_steps,
             )
     run.optimiser.zero_grad(set_to_none=True)

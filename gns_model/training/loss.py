@@ -6,14 +6,54 @@ points end, never at what the network said before: what contact corrects costs n
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields
+
 import torch
 from torch import Tensor
 
 from gns_model.learned.model import LearnedModel
 from gns_model.training.batches import Batch
+from gns_model.training.recipe import Recipe
 
 #: Share of a scene's moving points that are its front: those farthest along x.
 FRONT = 0.05
+
+
+@dataclass(frozen=True)
+class Emphasis:
+    """What the error of a step weighs more, and what less; by default all alike, squared.
+
+    Attributes:
+        linear_beyond: where the square turns into a straight line, in standard deviations
+            (pseudo-Huber, 2 d² (sqrt(1 + e²/d²) - 1)); None: nowhere. Impacts are rare and
+            large: a thousandth of the points holds a quarter of the squares.
+        momentum_weight: of the mean over scenes of the square (or pseudo-Huber) of a scene's mean
+            error. An error that all points share moves the centroid, or lets a heap sink into
+            itself, and hardly shows in the mean of squares.
+        front_weight: likewise of the mean error of a scene's front (`FRONT`), a twentieth of the
+            points that decides the runout, and a twentieth of the mean of squares.
+        scenes_alike: every scene of the batch counts as much as any other, not as many times as it
+            has points: a narrow column is a tenth of a wide one, and its runout as important.
+        relative_to: an acceleration q [standard deviations]. Errors are divided by
+            sqrt(s² + q²), s the root mean square of what is asked of the scene. A scene in
+            violent motion has large errors for a few steps, and a slow one small errors for so many
+            that they decide where it stops.
+    """
+
+    linear_beyond: float | None = None
+    momentum_weight: float = 0.0
+    front_weight: float = 0.0
+    scenes_alike: bool = False
+    relative_to: float | None = None
+
+    @classmethod
+    def of(cls, recipe: Recipe) -> Emphasis:
+        """What a recipe asks for under the same names."""
+        return cls(**{f.name: getattr(recipe, f.name) for f in fields(cls)})
+
+
+#: The paper's: the plain mean of squares.
+PLAIN = Emphasis()
 
 
 def step_error(
@@ -21,14 +61,10 @@ def step_error(
     history: Tensor,
     after: Tensor,
     move: Tensor,
+    emphasis: Emphasis = PLAIN,
     *,
     batch: Tensor | None = None,
     moving: Tensor | None = None,
-    linear_beyond: float | None = None,
-    momentum_weight: float = 0.0,
-    front_weight: float = 0.0,
-    scenes_alike: bool = False,
-    relative_to: float | None = None,
 ) -> Tensor:
     """Mean square of the normalised acceleration error, a scalar.
 
@@ -40,22 +76,9 @@ def step_error(
         history: shape (N, H+1, D); p is its last frame.
         after: p', predicted [m], shape (N, D).
         move: true displacement [m], shape (N, D).
-        linear_beyond: where the square turns into a straight line, in standard deviations
-            (pseudo-Huber, 2 d² (sqrt(1 + e²/d²) - 1)); default: nowhere. Impacts are rare and
-            large: a thousandth of the points holds a quarter of the squares.
+        emphasis: what weighs more.
         batch: scene of every point, shape (N,); default: all in one.
         moving: mask of the points that count, shape (N,); default: all.
-        momentum_weight: of the mean over scenes of the square (or pseudo-Huber) of a scene's mean
-            error. An error that all points share moves the centroid, or lets a heap sink into
-            itself, and hardly shows in the mean of squares.
-        front_weight: likewise of the mean error of a scene's front (`FRONT`), a twentieth of the
-            points that decides the runout, and a twentieth of the mean of squares.
-        scenes_alike: every scene of the batch counts as much as any other, not as many times as it
-            has points: a narrow column is a tenth of a wide one, and its runout as important.
-        relative_to: an acceleration q [standard deviations]. Errors are divided by
-            sqrt(s² + q²), s the root mean square of what `move` asks of the scene. A scene in
-            violent motion has large errors for a few steps, and a slow one small errors for so many
-            that they decide where it stops.
     """
     place, error = history[:, -1, 0], (after - history[:, -1]) - move
     asked = move - (history[:, -1] - history[:, -2])
@@ -65,19 +88,19 @@ def step_error(
     if batch is None:
         batch = torch.zeros(len(error), dtype=torch.long, device=error.device)
     unit = model.config.dt**2 * model.acceleration_std
-    error = error / unit
-    if relative_to is not None:
+    error, linear_beyond = error / unit, emphasis.linear_beyond
+    if emphasis.relative_to is not None:
         strong = _scene_mean((asked / unit).square(), batch).mean(1, keepdim=True)
-        error = error / (strong + relative_to**2).sqrt()[batch]
+        error = error / (strong + emphasis.relative_to**2).sqrt()[batch]
     loss = _penalty(error, linear_beyond)
-    loss = _scene_mean(loss, batch).mean() if scenes_alike else loss.mean()
-    if momentum_weight:
+    loss = _scene_mean(loss, batch).mean() if emphasis.scenes_alike else loss.mean()
+    if emphasis.momentum_weight:
         mean = _scene_mean(error, batch)
-        loss = loss + momentum_weight * _penalty(mean, linear_beyond).mean()
-    if front_weight:
+        loss = loss + emphasis.momentum_weight * _penalty(mean, linear_beyond).mean()
+    if emphasis.front_weight:
         ahead = _front(place.detach(), batch)
         mean = _scene_mean(error[ahead], batch[ahead])
-        loss = loss + front_weight * _penalty(mean, linear_beyond).mean()
+        loss = loss + emphasis.front_weight * _penalty(mean, linear_beyond).mean()
     return loss
 
 
@@ -110,24 +133,20 @@ def _front(place: Tensor, batch: Tensor) -> Tensor:
 def unrolled_loss(
     model: LearnedModel,
     batch: Batch,
+    emphasis: Emphasis = PLAIN,
     *,
     steps: int = 1,
     backprop: bool = False,
-    linear_beyond: float | None = None,
-    momentum_weight: float = 0.0,
-    front_weight: float = 0.0,
-    scenes_alike: bool = False,
-    relative_to: float | None = None,
     return_steps: float | None = None,
 ) -> Tensor:
     """Loss after the model has taken `steps` steps on its own, a scalar.
 
     Args:
+        emphasis: what weighs more in the error of a step.
         steps: 1 is plain one-step training; at most the K of the batch.
         backprop: mean of all steps' errors with gradients through all of them. Otherwise
             push-forward (Brandstetter et al. 2022): the first steps only prepare an input with
             the model's own error, and the last one is the loss.
-        linear_beyond, momentum_weight, front_weight, scenes_alike, relative_to: see `step_error`.
         return_steps: with push-forward, also ask for 1/return_steps of the way back: the true
             displacement less that part of how far a point has drifted from the truth. A heap that
             sinks into itself by a hair each step is one-step perfect and a puddle after fifty; so
@@ -136,17 +155,7 @@ def unrolled_loss(
 
     def error(after: Tensor, move: Tensor) -> Tensor:
         return step_error(
-            model,
-            history,
-            after,
-            move,
-            batch=batch.world.batch,
-            moving=batch.moving,
-            linear_beyond=linear_beyond,
-            momentum_weight=momentum_weight,
-            front_weight=front_weight,
-            scenes_alike=scenes_alike,
-            relative_to=relative_to,
+            model, history, after, move, emphasis, batch=batch.world.batch, moving=batch.moving
         )
 
     history = batch.history

@@ -60,7 +60,7 @@ class Recipe(BaseModel):
     weight_decay: NonNegative = 1e-4
     #: Error in standard deviations beyond which the loss grows linearly; none: squares all the way.
     linear_beyond: Positive | None = None
-    #: Weight of the error that all points of a scene share; see `loss.step_error`.
+    #: Weight of the error that all points of a scene share; see `loss.Emphasis`.
     momentum_weight: NonNegative = 0.0
     front_weight: NonNegative = 0.0  #: likewise of the front of a scene
     #: Errors count relative to what accelerates their scene, this much more [standard deviations].

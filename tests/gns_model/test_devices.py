@@ -22,7 +22,7 @@ from gns_model.mpm.torch_solver import TorchMpmSimulator
 from gns_model.scene import Scene
 from gns_model.smooth_measures import smooth_measures
 from gns_model.training.batches import collate
-from gns_model.training.loss import unrolled_loss
+from gns_model.training.loss import Emphasis, unrolled_loss
 
 MODELS = {
     "as baffle-lite": {},
@@ -127,10 +127,10 @@ def test_a_training_loss_says_where(backprop, flows):
             rng=np.random.default_rng(0),
             device=torch.device("cpu"),
         )
-        loss = unrolled_loss(
-            net, batch, steps=2, backprop=backprop, linear_beyond=0.25, momentum_weight=0.5,
-            front_weight=1.0, scenes_alike=True, return_steps=8,
-        )  # fmt: skip
+        emphasis = Emphasis(
+            linear_beyond=0.25, momentum_weight=0.5, front_weight=1.0, scenes_alike=True
+        )
+        loss = unrolled_loss(net, batch, emphasis, steps=2, backprop=backprop, return_steps=8)
         loss.backward()
     assert loss.item() > 0
 

@@ -18,7 +18,7 @@ from gns_model.training.augment import mirror_positions, mirrored
 from gns_model.training.batches import DRAW, collate, draw, generator, read
 from gns_model.training.distributed import Ranks
 from gns_model.training.feeding import Feeder
-from gns_model.training.loss import FRONT, step_error, unrolled_loss
+from gns_model.training.loss import FRONT, Emphasis, step_error, unrolled_loss
 from gns_model.training.statistics import measure
 
 SPACING, DT, RADIUS = 0.0625, 0.02, 0.1
@@ -265,7 +265,7 @@ def test_the_loss_turns_linear_where_asked(free_flight):
 
     def cost(error, beyond):
         after = history[:, -1] + move + error * scale
-        return float(step_error(net, history, after, move, linear_beyond=beyond))
+        return float(step_error(net, history, after, move, Emphasis(linear_beyond=beyond)))
 
     assert cost(1.0, None) == pytest.approx(1.0, rel=1e-2)
     assert cost(0.5, 10.0) == pytest.approx(0.25, rel=1e-2)
@@ -281,8 +281,9 @@ def test_an_error_that_a_scene_shares_weighs_more(free_flight):
     exact = history[:, -1] + move
 
     def cost(error, weight):
+        emphasis = Emphasis(momentum_weight=weight)
         after = exact + error[:, None] * scale
-        return float(step_error(net, history, after, move, batch=scene, momentum_weight=weight))
+        return float(step_error(net, history, after, move, emphasis, batch=scene))
 
     shared = torch.where(scene == 0, 1.0, -1.0)
     # +1 in every point of one scene, -1 in the other: each scene's mean error is one.
@@ -306,10 +307,11 @@ def test_an_error_of_the_front_weighs_more(free_flight):
     order = place.argsort(descending=True)
 
     def cost(rows, weight):
+        emphasis = Emphasis(front_weight=weight)
         error = torch.zeros(len(history))
         error[rows] = 1.0
         after = history[:, -1] + move + error[:, None] * scale
-        return float(step_error(net, history, after, move, batch=scene, front_weight=weight))
+        return float(step_error(net, history, after, move, emphasis, batch=scene))
 
     rear = order[int((scene == 0).sum()) - count : int((scene == 0).sum())]
     share = count / len(history)
@@ -326,12 +328,13 @@ def test_a_small_scene_can_count_as_much_as_a_large_one(free_flight):
     after = batch.history[:, -1] + batch.moves[:, 0]
     after = after + error[:, None] * DT**2 * net.acceleration_std
 
-    def cost(**options):
-        return float(step_error(net, batch.history, after, batch.moves[:, 0], **options))
+    def cost(batch_of=None, **emphasis):
+        move, weighing = batch.moves[:, 0], Emphasis(**emphasis)
+        return float(step_error(net, batch.history, after, move, weighing, batch=batch_of))
 
     share = count // 4 / count
-    assert cost(batch=scene) == pytest.approx(share, rel=1e-2)
-    assert cost(batch=scene, scenes_alike=True) == pytest.approx(1 / 2, rel=1e-2)
+    assert cost(scene) == pytest.approx(share, rel=1e-2)
+    assert cost(scene, scenes_alike=True) == pytest.approx(1 / 2, rel=1e-2)
     assert cost(scenes_alike=True) == pytest.approx(share, rel=1e-2)
 
 
@@ -345,9 +348,9 @@ def test_errors_count_relative_to_what_accelerates_the_scene(free_flight):
     now, before = batch.history[:, -1], batch.history[:, -2]
     move = now - before - 3.0 * unit * scene[:, None]
 
-    def cost(error, **options):
-        after = now + move + error * unit
-        return float(step_error(net, batch.history, after, move, batch=scene, **options))
+    def cost(error, **emphasis):
+        after, weighing = now + move + error * unit, Emphasis(**emphasis)
+        return float(step_error(net, batch.history, after, move, weighing, batch=scene))
 
     assert cost(1.0) == pytest.approx(1.0, rel=1e-2)
     expected = (1 / 16 + 1 / 25) / 2

@@ -18,7 +18,7 @@ from gns_model.training import Recipe, RecipeError, train
 from gns_model.training.batches import Draw, collate, read
 from gns_model.training.distributed import Ranks
 from gns_model.training.kinematic import kinematic_spacing, with_baffle_points
-from gns_model.training.loss import unrolled_loss
+from gns_model.training.loss import Emphasis, unrolled_loss
 from gns_model.training.setup import open_data
 from gns_model.training.statistics import measure
 from gns_model.training.validation import Validator
@@ -85,7 +85,7 @@ def test_what_stands_still_gets_no_noise_and_is_not_in_the_loss(slides):
     # The loss is the mean over moving points, whatever the target of the others says.
     @torch.no_grad()
     def loss(moves: torch.Tensor) -> float:
-        return float(unrolled_loss(net, replace(batch, moves=moves), momentum_weight=1.0))
+        return float(unrolled_loss(net, replace(batch, moves=moves), Emphasis(momentum_weight=1.0)))
 
     moves = batch.moves.clone()
     moves[still] = 7.0
