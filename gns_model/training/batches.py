@@ -22,7 +22,7 @@ from gns_model.training.noise import random_walk
 from gns_model.training.statistics import Statistics
 
 #: Purposes of random generators.
-DRAW, NOISE, UNROLL, REPLAY = 1, 2, 3, 4
+DRAW, NOISE, UNROLL, REPLAY, FLOWS = 1, 2, 3, 4, 5
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from gns_model.data.windows import WindowIndex
 from gns_model.files import write_whole
 from gns_model.learned.checkpoint import save_model
 from gns_model.learned.model import LearnedModel
@@ -17,7 +18,9 @@ from gns_model.training import batches
 from gns_model.training.claim import TrainingError, claim, tidy
 from gns_model.training.distributed import RankError, Ranks, session
 from gns_model.training.feeding import Feeder
+from gns_model.training.flows import draw_flows, flow_gradient
 from gns_model.training.heap import release_heap
+from gns_model.training.kinematic import kinematic_spacing
 from gns_model.training.launching import end_with_launcher
 from gns_model.training.loss import Emphasis, step_error, unrolled_loss
 from gns_model.training.progress import Display
@@ -156,7 +159,7 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: Stop) ->
                 progress = done / budget
                 with stop.may_abandon():
                     loss, edges = _forward_and_backward(
-                        run, recipe, feeder, replay, ranks, progress
+                        run, recipe, data, feeder, replay, ranks, progress
                     )
                 rate = learning_rate(recipe, position.step, progress)
 
@@ -233,24 +236,52 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: Stop) ->
 
 
 def _forward_and_backward(
-    run: Run, recipe: Recipe, feeder: Feeder, replay: Replay, ranks: Ranks, progress: float
+    run: Run,
+    recipe: Recipe,
+    data: WindowIndex,
+    feeder: Feeder,
+    replay: Replay,
+    ranks: Ranks,
+    progress: float,
 ) -> tuple[Tensor, float]:
-    """Loss of this rank's windows of the next step, with its gradients in the parameters.
+    """Loss of this rank's share of the next step, with its gradients in the parameters.
 
     Returns:
         the loss, a scalar, and the number of edges.
     """
-    step = run.position.step
+    step, model = run.position.step, run.model
     autocast = recipe.precision == "bfloat16"
     context = torch.autocast(ranks.device.type, torch.bfloat16) if autocast else nullcontext()
     unrolled = progress >= 1 - recipe.unroll_fraction
+    kinematic = kinematic_spacing(recipe.model)
     rng = batches.generator(recipe.seed, batches.REPLAY, step)  # the same on all ranks
+    run.optimiser.zero_grad(set_to_none=True)
+    if recipe.flow_share and unrolled and rng.random() < recipe.flow_share:
+        flows = draw_flows(
+            data,
+            batches.generator(recipe.seed, batches.FLOWS, step),
+            recipe,
+            run.position.statistics,
+            ranks=ranks.world,
+        )[ranks.rank]
+        loss = flow_gradient(
+            model,
+            [
+                batches.read(data, flow.draw, unroll=flow.steps, kinematic=kinematic)
+                for flow in flows
+            ],
+            [p for p in model.parameters() if p.requires_grad],
+            clip_norm=recipe.clip_norm,
+            context=context,
+            device=ranks.device,
+        )
+        return loss, sum(flow.edges for flow in flows)
     if recipe.replay and unrolled and rng.random() < recipe.replay_share:
         batch, edges = replay.take(step)
         with context:
-            after = run.model.step(batch.history, batch.world)
+            after = model.step(batch.history, batch.world)
             loss = step_error(
-                run.model,
+                model,
                 batch.history,
                 after,
                 batch.moves[:, 0],
@@ -263,20 +294,19 @@ def _forward_and_backward(
         windows, edges = feeder.take(step, progress)
         batch = batches.collate(
             windows,
-            noise_std=run.model.config.noise_std,
+            noise_std=model.config.noise_std,
             rng=batches.generator(recipe.seed, batches.NOISE, step, ranks.rank),
             device=ranks.device,
         )
         with context:
             loss = unrolled_loss(
-                run.model,
+                model,
                 batch,
                 Emphasis.of(recipe),
                 steps=feeder.unroll(step, progress),
                 backprop=recipe.backprop_through_unroll,
                 return_steps=recipe.return_steps,
             )
-    run.optimiser.zero_grad(set_to_none=True)
     loss.backward()
     return loss, edges
 

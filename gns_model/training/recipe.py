@@ -86,6 +86,12 @@ class Recipe(BaseModel):
     replay_steps: Count = 40
     #: Share of the steps that are about them; the others look at true states and keep them right.
     replay_share: Fraction = 0.5
+    #: Share of the steps of the unrolled phase, taken before that of `replay`, that train through
+    #: whole flows (`flows`): what such a step costs is about `flow_edges`, the edges of this rank's
+    #: flows summed over their steps, of which a flow has at most `flow_steps`.
+    flow_share: Fraction = 0.0
+    flow_steps: Count = 100
+    flow_edges: Count = 1_000_000
     #: Let gradients flow through all K steps; else only through each step's own (push-forward).
     backprop_through_unroll: bool = False
 

@@ -85,8 +85,12 @@ def test_the_best_model_is_kept(tiny, tmp_path):
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"replay": 5, "replay_steps": 3, "return_steps": 4, "unroll_fraction": 1.0}],
-    ids=["windows", "replay"],
+    [
+        {},
+        {"replay": 5, "replay_steps": 3, "return_steps": 4, "unroll_fraction": 1.0},
+        {"flow_share": 0.7, "flow_steps": 4, "flow_edges": 3000, "unroll_fraction": 1.0},
+    ],
+    ids=["windows", "replay", "flows"],
 )
 def test_resume_is_bit_exact_after_a_signal(tiny, tmp_path, monkeypatch, same_state, options):
     """Six steps at once, and three, SIGTERM, three: the same weights, average and moments."""

@@ -1,0 +1,191 @@
+"""Training through whole flows: what a person reads off a rollout, differentiated in the weights.
+
+The error of a step hardly sees what decides where a flow ends: an error of a hundredth of g that
+all points share and all steps repeat. Here the model rolls a flow out by itself, for as long as it
+lasts, and is asked for the place of the mass in every frame, not of every grain: coordinates are
+compared in order of size, axis by axis (the squared Wasserstein distance of two heaps in one
+dimension), so that grains which trade places cost nothing; the front by itself; and, where there
+are baffles, the depth upstream of them. A bias that all flows share lies in few directions of the
+weights, so a hundred such steps do what ten thousand steps on windows do not.
+
+The backward pass limits and shares the adjoints of the grains, as design gradients need it, too
+(`learned.adjoint`); every step is computed again in it, so that memory holds one step's inside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint as rematerialise
+
+from gns_model.data.windows import Window, WindowIndex
+from gns_model.learned.adjoint import ADJOINT_LIMIT, ADJOINT_SMOOTHING, FilterAdjoint
+from gns_model.learned.model import LearnedModel
+from gns_model.smooth_measures import smooth_upstream_depth
+from gns_model.training import batches
+from gns_model.training.batches import Draw
+from gns_model.training.loss import FRONT
+from gns_model.training.recipe import Recipe
+from gns_model.training.statistics import Statistics
+
+#: Relative error below which a flow counts as right: there the loss turns from a straight line into
+#: a square, or flows that are right already would pull as hard as those that are not.
+RIGHT = 0.02
+#: Share of the flows that are seen from their beginning; the others begin anywhere.
+FROM_START = 0.6
+
+
+@dataclass(frozen=True)
+class Flow:
+    """One flow to roll out: where it begins, for how many steps, and its edges over all of them."""
+
+    draw: Draw
+    steps: int
+
+    @property
+    def edges(self) -> float:
+        return self.steps * self.draw.edges
+
+
+def draw_flows(
+    index: WindowIndex,
+    rng: np.random.Generator,
+    recipe: Recipe,
+    statistics: Statistics,
+    *,
+    ranks: int,
+) -> list[list[Flow]]:
+    """The flows of one step for every rank.
+
+    Each rank gets about `recipe.flow_edges` edges, summed over all steps, and at least one flow;
+    one that would have more by itself is not rolled to its end.
+    Every rank calls this with the same generator and takes its own part.
+    """
+    chosen: list[Flow] = []
+    total = 0.0
+    while True:
+        source = int(rng.integers(len(index.sources)))
+        entry, stride = index.sources[source], index.stride(source)
+        last = (index.starts(source, 1) - 1) // stride  # counted in steps of the model
+        begin = 0 if rng.random() < FROM_START else int(rng.integers(last // 2 + 1))
+        steps = min(recipe.flow_steps, last + 1 - begin)
+        mixture, flip = int(rng.integers(2**31)), bool(rng.integers(2)) and recipe.mirror
+        half = recipe.halves and entry.plane is not None and rng.random() < 0.5
+        points = len(entry.residue) // index.residues(source)
+        edges = statistics.edges(points, (begin + steps / 2) / (last + 1)) / (2 if half else 1)
+        steps = max(1, min(steps, int(recipe.flow_edges / edges)))
+        flow = Flow(Draw(source, stride * begin, mixture, flip, edges, half), steps)
+        if len(chosen) >= ranks and total + flow.edges / 2 > ranks * recipe.flow_edges:
+            break
+        chosen.append(flow)
+        total += flow.edges
+    parts: list[list[Flow]] = [[] for _ in range(ranks)]
+    for flow in sorted(chosen, key=lambda f: -f.edges):
+        min(parts, key=lambda part: sum(f.edges for f in part)).append(flow)
+    return parts
+
+
+def flow_gradient(
+    model: LearnedModel,
+    windows: Sequence[Window],
+    parameters: Sequence[nn.Parameter],
+    *,
+    clip_norm: float,
+    context: AbstractContextManager[object],
+    device: torch.device,
+) -> Tensor:
+    """Mean error of flows, a scalar; its gradient is left in `parameters`.
+
+    A flow that hangs on few grains has a gradient many times the usual one, and all flows vote: no
+    flow's gradient is longer than `clip_norm`.
+
+    Args:
+        windows: where each flow begins, with as many frames of the future as it is to be rolled.
+        context: autocast, or nothing.
+    """
+    sums = [torch.zeros_like(p) for p in parameters]
+    total = torch.zeros((), device=device)
+    for window in windows:
+        with context:
+            error = flow_error(model, window, device)
+        parts = torch.autograd.grad(error, parameters, allow_unused=True)
+        found = [p for p in parts if p is not None]
+        norm = torch.stack([p.square().sum() for p in found]).sum().sqrt()
+        scale = (clip_norm / norm.clamp_min(1e-12)).clamp(max=1.0) / len(windows)
+        for own, part in zip(sums, parts, strict=True):
+            if part is not None:
+                own += scale * part
+        total += error.detach() / len(windows)
+    for parameter, own in zip(parameters, sums, strict=True):
+        parameter.grad = own
+    return total
+
+
+def flow_error(model: LearnedModel, window: Window, device: torch.device) -> Tensor:
+    """Relative error of one flow that the model rolls out from the truth, a scalar.
+
+    sqrt(e² + RIGHT²) - RIGHT, where e² is the mean over the frames of
+
+        sum over axes of mean_i (x_(i) - x'_(i))² / s²  +  (mean of the front's x error)² / s²,
+
+    x_(i) the i-th smallest coordinate, s the way that the true front makes, or the mass where that
+    is more; and, where there are baffles, the square of the relative error of the upstream depth.
+
+    Args:
+        window: the truth, with a future (N, K, D) [m] to be rolled out.
+    """
+    rng = np.random.default_rng(0)  # not used: there is no noise
+    batch = batches.collate([window], noise_std=0.0, rng=rng, device=device)
+    moving = batch.world.moving
+    true = batch.history[:, -1:] + batch.moves.cumsum(1)
+    rolled = roll(model, batch, steps=batch.moves.shape[1])
+    found, true, begun = rolled[moving], true[moving], batch.history[moving, -1]
+    count = max(1, int(FRONT * len(true)))
+
+    def front(positions: Tensor) -> Tensor:
+        """Mean x of the front, of sorted positions (N, K, D)."""
+        return positions[-count:, :, 0].mean(0)
+
+    ordered, wanted = found.sort(0).values, true.sort(0).values
+    begun = begun.sort(0).values
+    way = (front(wanted)[-1] - begun[-count:, 0].mean()).abs()
+    travel = (wanted[:, -1] - begun).square().sum(1).mean().sqrt()
+    way = torch.maximum(way, travel).clamp_min(2 * model.config.spacing)
+    body = (ordered - wanted).square().mean(0).sum(-1)
+    square = ((body + (front(ordered) - front(wanted)).square()) / way**2).mean()
+    scene = window.scene
+    if scene.baffles and model.config.dim == 3:
+        centres = torch.tensor([b.center for b in scene.baffles], device=device)
+        sizes = torch.tensor([b.size for b in scene.baffles], device=device)
+        yaws = torch.tensor([b.yaw for b in scene.baffles], device=device)
+        volume = sum(float(np.prod(r.size)) for r in scene.releases) / len(true)
+        own, other = (
+            smooth_upstream_depth(p.transpose(0, 1), scene, centres, sizes, volume, yaws=yaws)
+            for p in (found, true)
+        )
+        square = square + ((own - other) / other.clamp_min(model.config.spacing)).square()
+    return (square + RIGHT**2).sqrt() - RIGHT
+
+
+def roll(model: LearnedModel, batch: batches.Batch, steps: int) -> Tensor:
+    """Positions after each of `steps` steps of the model [m], shape (N, steps, D)."""
+    world, depth = batch.world, model.config.history + 1
+    track = list(batch.history.unbind(1))
+    counts = torch.bincount(world.batch).tolist()
+
+    def step(*past: Tensor) -> Tensor:
+        return model.step(torch.stack(past, dim=1), world)
+
+    for _ in range(steps):
+        after = rematerialise(step, *track[-depth:], use_reentrant=False)
+        track.append(
+            FilterAdjoint.apply(
+                after, counts, world.moving, ADJOINT_LIMIT, ADJOINT_SMOOTHING, model.config.radius
+            )
+        )
+    return torch.stack(track[depth:], dim=1)

@@ -1,0 +1,235 @@
+"""Training through whole flows: what their error sees, its gradient, and who rolls which."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from gns_model.data.windows import WindowIndex
+from gns_model.learned.config import ModelConfig
+from gns_model.learned.model import LearnedModel
+from gns_model.training import Recipe, batches, flows, train
+from gns_model.training.flows import draw_flows, flow_error, flow_gradient
+from gns_model.training.statistics import measure
+
+SPACING, DT, RADIUS = 0.0625, 0.02, 0.1
+CPU = torch.device("cpu")
+
+
+def index(folder, **changes):
+    options = {"spacing": SPACING, "dt": DT, "history": 3, "unroll": 1}
+    return WindowIndex([folder], **{**options, **changes})
+
+
+def statistics(windows):
+    return measure(windows, windows=64, radius=RADIUS, noise_std=0.0, subtract_gravity=True)
+
+
+def model(ballistic: bool = False, **changes) -> LearnedModel:
+    """Random weights; or one that predicts a = g."""
+    torch.manual_seed(0)
+    options = {"spacing": SPACING, "dt": DT, "radius": RADIUS, "latent": 8, "blocks": 2}
+    net = LearnedModel(ModelConfig(**{**options, **changes}))
+    if ballistic:
+        with torch.no_grad():
+            for p in net.network.decode.parameters():
+                p.zero_()
+    return net
+
+
+@pytest.fixture
+def window(slides):
+    """Eight steps of a slide in float64; no two of its grains have a coordinate in common."""
+    found = index(slides).read(0, 0, mixture=1, unroll=8)
+    apart = np.random.default_rng(0).uniform(-0.01, 0.01, (len(found.history), 1, 3))
+    return replace(found, history=found.history + apart, future=found.future + apart)
+
+
+# -- the error of a flow ---------------------------------------------------------------------------
+
+
+def test_a_model_that_knows_the_law_has_no_error(free_flight):
+    """From the second step on, whose history knows gravity; and less of it is an error."""
+    windows = index(free_flight, spacing=SPACING, dt=0.01)
+    window = windows.read(0, 2, unroll=6)
+    net = model(ballistic=True, dt=0.01)
+    with torch.no_grad():
+        assert float(flow_error(net, window, CPU)) < 1e-4
+        net.acceleration_mean[1] = 5.0
+        assert float(flow_error(net, window, CPU)) > 0.01
+
+
+def test_grains_that_trade_places_cost_nothing(window):
+    """The truth with its grains in another order is the same heap."""
+    net, rng = model().double(), np.random.default_rng(0)
+    other = replace(window, future=window.future[rng.permutation(len(window.future))])
+    with torch.no_grad():
+        found, same = (float(flow_error(net, w, CPU)) for w in (window, other))
+        moved = replace(window, future=window.future + 0.05)
+        assert float(flow_error(net, moved, CPU)) > 1.2 * found
+    assert same == pytest.approx(found, rel=1e-4)
+
+
+def rolled_by(monkeypatch, shift):
+    """Let `roll` return the truth, moved by `shift(positions (N, K, D))`."""
+
+    def roll(model, batch, steps):
+        true = batch.history[:, -1:] + batch.moves.cumsum(1)
+        return true + shift(true)
+
+    monkeypatch.setattr(flows, "roll", roll)
+
+
+def test_a_front_that_lags_is_seen_by_itself(window, monkeypatch):
+    """As many grains off by as much: at the front, and in the middle of the heap. Their way is
+    that of the front from the start to the end of the window."""
+    last = window.future[:, -1, 0]
+    count = max(1, int(flows.FRONT * len(last)))
+    order = torch.from_numpy(np.argsort(last))
+    lag = 1e-6  # they keep their order
+
+    def error(rows):
+        def shift(true):
+            out = torch.zeros_like(true)
+            out[rows, :, 0] = -lag
+            return out
+
+        rolled_by(monkeypatch, shift)
+        return float(flow_error(model(), window, CPU))
+
+    front, middle = error(order[-count:]), error(order[len(order) // 2 :][:count])
+    assert front > 5 * middle
+    way = np.sort(last)[-count:].mean() - np.sort(window.history[:, -1, 0])[-count:].mean()
+    travel = np.sort(window.future[:, -1], axis=0) - np.sort(window.history[:, -1], axis=0)
+    way = max(way, np.sqrt(np.square(travel).sum(1).mean()), 2 * SPACING)
+    square = lag**2 * (1 + count / len(last)) / way**2
+    expected = np.sqrt(square + flows.RIGHT**2) - flows.RIGHT
+    assert front == pytest.approx(expected, rel=0.05)
+
+
+def test_the_depth_upstream_of_a_baffle_counts(window, monkeypatch):
+    """A heap that is higher just upstream of a baffle, and one that is so elsewhere."""
+    scene = window.scene
+    x, z = (float(np.median(window.future[:, -1, k])) for k in (0, 2))
+    size = scene.baffles[0].size
+
+    def error(place):
+        [baffle] = scene.baffles
+        moved = scene.replace(baffles=(baffle.model_copy(update={"center": place}),))
+        rolled_by(monkeypatch, lambda true: 0.02 * torch.tensor([0.0, 1.0, 0.0]))
+        return float(flow_error(model(), replace(window, scene=moved), CPU))
+
+    assert error((x + 0.05 + size[0] / 2, z)) > 1.02 * error((0.7, 0.75))
+
+
+def test_its_gradient_is_that_of_differences(window, monkeypatch):
+    """In float64 with nothing limited or shared, over eight steps; the limits are another test."""
+    monkeypatch.setattr(flows, "ADJOINT_LIMIT", None)
+    monkeypatch.setattr(flows, "ADJOINT_SMOOTHING", 0.0)
+    net = model().double()
+    weights = (
+        [net.network.decode[-1].bias]
+        if hasattr(net.network.decode, "__getitem__")
+        else [list(net.network.decode.parameters())[-1]]
+    )
+    [found] = torch.autograd.grad(flow_error(net, window, CPU), weights)
+    [weight] = weights
+    step = 1e-6
+    for axis in (0, 1):
+        values = []
+        for sign in (1, -1):
+            with torch.no_grad():
+                weight[axis] += sign * step
+                values.append(float(flow_error(net, window, CPU)))
+                weight[axis] -= sign * step
+        expected = (values[0] - values[1]) / (2 * step)
+        assert float(found[axis]) == pytest.approx(expected, rel=1e-3)
+
+
+def test_a_step_down_the_gradient_makes_flows_better(slides):
+    windows, net = index(slides), model()
+    statistics(windows).apply(net)
+    some = [windows.read(k, 0, mixture=k, unroll=9) for k in (0, 1)]
+    parameters = list(net.parameters())
+
+    def descend():
+        return flow_gradient(
+            net, some, parameters, clip_norm=1.0, context=nullcontext(), device=CPU
+        )
+
+    first = float(descend())
+    for _ in range(20):
+        with torch.no_grad():
+            for p in parameters:
+                p -= 0.5 * p.grad
+        last = float(descend())
+    assert last < 0.9 * first
+
+
+def test_no_flow_has_more_than_its_vote(slides):
+    windows, net = index(slides), model()
+    some = [windows.read(k, 0, mixture=k, unroll=9) for k in (0, 1)]
+    parameters = list(net.parameters())
+
+    def length(clip_norm):
+        flow_gradient(net, some, parameters, clip_norm=clip_norm, context=nullcontext(), device=CPU)
+        return float(torch.cat([p.grad.flatten() for p in parameters]).norm())
+
+    free = length(1e9)
+    assert length(1e-3 * free) <= 1.0001e-3 * free
+
+
+# -- who rolls what --------------------------------------------------------------------------------
+
+
+def test_every_rank_gets_flows_of_about_as_many_edges(slides, tiny):
+    windows = index(slides)
+    about = statistics(windows)
+    recipe = Recipe.from_dict({**tiny, "flow_steps": 7, "flow_edges": 40_000, "mirror": True})
+
+    def parts(step):
+        rng = batches.generator(0, batches.FLOWS, step)
+        return draw_flows(windows, rng, recipe, about, ranks=3)
+
+    assert parts(3) == parts(3)
+    assert parts(3) != parts(4)
+    found = [[sum(f.edges for f in part) for part in parts(k)] for k in range(20)]
+    assert np.mean(found) == pytest.approx(40_000, rel=0.2)
+    every = [f for k in range(20) for part in parts(k) for f in part]
+    assert all(1 <= f.steps <= 7 for f in every)
+    assert 0.4 < np.mean([f.draw.frame == 0 for f in every]) < 0.9
+    assert {f.draw.mirror for f in every} == {True, False}
+    for flow in every[:10]:  # none is asked for frames that its file does not have
+        assert batches.read(windows, flow.draw, unroll=flow.steps).future.shape[1] == flow.steps
+
+
+def test_a_flow_that_is_too_dear_is_cut_short(slides, tiny):
+    windows = index(slides)
+    recipe = Recipe.from_dict({**tiny, "flow_steps": 9, "flow_edges": 3000})
+    rng = np.random.default_rng(0)
+    parts = draw_flows(windows, rng, recipe, statistics(windows), ranks=2)
+    assert [len(part) for part in parts] == [1, 1]
+    assert all(f.steps < 9 and f.edges <= 3000 for part in parts for f in part)
+
+
+# -- in a run --------------------------------------------------------------------------------------
+
+
+def test_flow_steps_are_what_the_recipe_asks_for(tiny, tmp_path, monkeypatch):
+    """None where the share is 0; in the unrolled phase only where it is 1."""
+    seen = []
+
+    def counted(*args, **options):
+        seen.append(1)
+        return flow_gradient(*args, **options)
+
+    monkeypatch.setattr("gns_model.training.loop.flow_gradient", counted)
+    values = {**tiny, "valid": [], "steps": 6, "flow_steps": 2, "flow_edges": 2000}
+    train(Recipe.from_dict(values), tmp_path / "none")
+    assert not seen
+    train(Recipe.from_dict({**values, "flow_share": 1.0}), tmp_path / "half")
+    assert len(seen) == 3
