@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from gns_model.cli import Family
-from gns_model.data.scenes import FAMILIES, PARTS, draw
+from gns_model.data.column_scenes import PARTS
+from gns_model.data.scenes import FAMILIES, draw
 from gns_model.errors import SceneError
 from gns_model.particles import fill
 
