@@ -61,6 +61,11 @@ class Stop:
             if self._late:
                 raise Abandoned
             yield
+        except SystemError as error:
+            # Compiled code that calls back into Python says so when that raised, as numba does.
+            if self._late:
+                raise Abandoned from None
+            raise
         finally:
             self._free = False
 
