@@ -61,7 +61,7 @@ class Stop:
             if self._late:
                 raise Abandoned
             yield
-        except SystemError as error:
+        except SystemError:
             # Compiled code that calls back into Python says so when that raised, as numba does.
             if self._late:
                 raise Abandoned from None

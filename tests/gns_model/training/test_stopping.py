@@ -48,6 +48,13 @@ def test_a_request_waits_for_the_step_and_then_gives_it_up(monkeypatch):
             pytest.fail("nothing new is begun")
 
 
+def as_compiled_code_says(function, *arguments) -> None:
+    try:
+        function(*arguments)
+    except Abandoned as error:
+        raise SystemError("returned a result with an exception set") from error
+
+
 def test_compiled_code_may_hide_that_a_step_was_given_up(monkeypatch):
     """Numba turns what a signal handler raises inside of it into a SystemError; one that comes
     without a request stays what it is."""
@@ -57,10 +64,7 @@ def test_compiled_code_may_hide_that_a_step_was_given_up(monkeypatch):
             raise SystemError("a fault of its own")
         os.kill(os.getpid(), signal.SIGTERM)
         with pytest.raises(Abandoned), stop.may_abandon():
-            try:
-                wait(10)
-            except Abandoned as error:
-                raise SystemError("returned a result with an exception set") from error
+            as_compiled_code_says(wait, 10)
 
 
 def test_what_has_to_last_is_never_interrupted(monkeypatch):
