@@ -1,8 +1,10 @@
 """One lesson of `--refine`: the verified trajectories as training data, and the training on them.
 
-The recipe is that of the last leg of the shipped models, cut short: the model is unrolled over up
-to ten steps and asked back from where it drifts to, at a low rate. Nothing in the verified layouts
-keeps it from forgetting other flows but that rate, unless it is given the data that it came from.
+The model is trained through whole flows (`gns_model.training.flows`): what a site has in common,
+such as a friction that the model never saw, is a bias of all of its flows, and a few steps through
+flows from their release to rest mend that, where hundreds of steps on windows do not. Nothing in
+the verified layouts keeps it from forgetting other flows but the low rate, unless it is given the
+data that it came from.
 """
 
 from __future__ import annotations
@@ -34,15 +36,14 @@ from gns_model.trajectory import open_trajectory
 if TYPE_CHECKING:
     from design.run import Run
 
-#: Steps of the model that a training rollout is unrolled over at most.
-UNROLL = 10
+LEARNING_RATE = 5e-5
 
-LEARNING_RATE = 3e-4
+#: Edges of the flows of a step on one rank, summed over time: about one flume, 30 CPU seconds.
+FLOW_EDGES = 3_000_000
 
-#: Optimiser steps below which a refinement is not to be trusted. On four layouts of the flume, 200
-#: took the centroid's gap on four others from 3.4 to 2.5 %; 13, on a machine that had no time for
-#: more, from 2.7 to 6 %: the first steps of an optimiser that has no moments yet go astray.
-FEW = 100
+#: Optimiser steps below which a refinement is not to be trusted: the first steps of an optimiser
+#: that has no moments yet go astray.
+FEW = 5
 
 #: What one process of the training takes with a batch of one flume, heap included [bytes].
 RANK_MEMORY = 4e9
@@ -123,12 +124,12 @@ def recipe_of(
         FileFormatError: if there are no trajectories in `data`.
     """
     config = lesson.start.load().config  # type: ignore[attr-defined]
-    steps = min(round(s.duration / config.dt) for s in scenes)
+    steps = max(round(s.duration / config.dt) for s in scenes)
     lessons = str(lesson.folder / "lessons")
     train = [lessons]
     if data is not None:
         old = len(training_files(data))
-        # Trajectories are drawn uniformly: half of the windows shall come from the new ones.
+        # Trajectories are drawn uniformly: half of the flows shall be new ones.
         train = [lessons] * max(1, round(old / len(scenes))) + [str(data)]
     return Recipe(
         name=f"{Path(lesson.start.name).name}, refined",
@@ -136,17 +137,13 @@ def recipe_of(
         model=config,
         train=tuple(train),
         minutes=minutes,
-        edges_per_batch=60_000,
         learning_rate=LEARNING_RATE,
-        warmup=0.05,
-        ema_decay=0.98,
-        linear_beyond=3.0,
-        momentum_weight=10.0,
-        early=0.5,
-        early_steps=max(1, min(24, steps // 2)),
-        unroll=max(1, min(UNROLL, steps // 2)),
+        warmup=0.1,
+        ema_decay=0.8,
         unroll_fraction=1.0,
-        return_steps=8.0,
+        flow_share=1.0,
+        flow_steps=max(1, steps),
+        flow_edges=FLOW_EDGES,
         statistics_windows=32,  # the model keeps those it was trained with
         device="cpu" if lesson.start.device == "cpu" else "cuda",
         precision="bfloat16",

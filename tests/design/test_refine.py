@@ -212,6 +212,7 @@ def test_half_of_the_training_is_on_what_must_not_be_forgotten(scene, tmp_path):
     lesson = lessons.Lesson(tmp_path / "refined-1", model, (), ())
     recipe = lessons.recipe_of(lesson, [scene] * 4, minutes=1.0, data=old)
     assert recipe.train == (str(tmp_path / "refined-1" / "lessons"),) * 3 + (str(old),)
-    assert recipe.unroll == 5  # of ten steps in the whole flow
+    assert recipe.flow_share == 1
+    assert recipe.flow_steps == 10  # to the end of the flow
     with pytest.raises(FileFormatError, match="no trajectory files"):
         lessons.recipe_of(lesson, [scene], minutes=1.0, data=tmp_path / "tiny")
