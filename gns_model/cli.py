@@ -52,6 +52,7 @@ class Family(StrEnum):
     spreading_friction = "spreading-friction"
     pressed = "pressed"
     pressed_friction = "pressed-friction"
+    bare = "bare"
 
 
 @app.command()

@@ -89,6 +89,23 @@ def runout_over_time(trajectory: Trajectory, *, quantile: float = 1.0) -> np.nda
     return front - front[0]
 
 
+def thinned_front_over_time(trajectory: Trajectory, points: int) -> np.ndarray:
+    """Expected x of the farthest of `points` material points, drawn at random [m], shape (T,).
+
+    A front is a maximum, and that of fewer points is less far: of every eighth of the points of the
+    flume it is 8% short. Two simulations with points of different size are compared by the same
+    number of them. With f = points / N the k-th farthest is the farthest drawn with probability
+    f (1 - f)^(k - 1), each point drawn or not by itself.
+    """
+    x = moving_positions(trajectory)[:, :, 0]
+    share = min(1.0, points / x.shape[1])
+    kept = min(x.shape[1], 1 + int(np.ceil(16 / share)))  # what follows weighs below e^-16
+    ordered = -np.partition(-x, kept - 1, axis=1)[:, :kept]
+    ordered = -np.sort(-ordered, axis=1).astype(float)
+    weight = share * (1 - share) ** np.arange(kept)
+    return ordered @ (weight / weight.sum())
+
+
 def centroid_over_time(trajectory: Trajectory) -> np.ndarray:
     """Centre of mass [m], shape (T, D)."""
     return moving_positions(trajectory).mean(axis=1, dtype=float)

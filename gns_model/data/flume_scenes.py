@@ -80,16 +80,18 @@ def random_scene(rng: np.random.Generator, index: int) -> Scene:
     )
 
 
+def bare_scene(rng: np.random.Generator, index: int) -> Scene:
+    """A scene of the family "bare"."""
+    return Scene.from_dict(_flume(*_varied(rng), rng.uniform(1.6, 2.4)))
+
+
 def flume_scene(rng: np.random.Generator, index: int) -> Scene:
     """A scene of the family "flume"."""
-    length, height, width = 0.35, 0.25, 1.4
-    length *= rng.uniform(0.85, 1.15)
-    height *= rng.uniform(0.85, 1.15)
-    width *= rng.uniform(0.85, 1.15)
+    size = _varied(rng)
     common = rng.random() < 0.6  # most layouts are of equal baffles near the paper's size
     one = (rng.uniform(0.1, 0.2), rng.uniform(0.22, 0.36), rng.uniform(0.1, 0.25))
     return _with_random_baffles(
-        _flume(length, height, width, rng.uniform(1.6, 2.4)),
+        _flume(*size, rng.uniform(1.6, 2.4)),
         rng,
         count=int(rng.integers(1, 7)),
         size=lambda: (
@@ -113,6 +115,12 @@ def layout_scene(rng: np.random.Generator, index: int) -> Scene:
         earliest=0.6,
         latest=1.5,
     )
+
+
+def _varied(rng: np.random.Generator) -> tuple[float, float, float]:
+    """Length, height and width of a release within 15% of the paper's [m]."""
+    length, height, width = (x * rng.uniform(0.85, 1.15) for x in (0.35, 0.25, 1.4))
+    return length, height, width
 
 
 def _flume(length: float, height: float, width: float, speed: float) -> dict:

@@ -22,11 +22,12 @@ and for what the paper's aspect ratios ask of a model that has seen aspect 1 onl
     pressed-friction
                 2D: the same at the five angles in turn
 
-and three that are made for layouts of baffles in the flume:
+and four that are made for layouts of baffles in the flume:
 
     random   domain, release (size, place, height of fall, velocity) and one to four baffles of
              random size and place: the paper's barrier dataset, widened
     flume    the paper's flume with a release varied by some 15% and one to six random baffles
+    bare     the same releases without baffles: what every layout is compared with
     layouts  the paper's flume exactly, with three of its own baffles placed at random: unseen
              layouts to choose and to judge a model by
 """
@@ -47,7 +48,13 @@ from gns_model.data.column_scenes import (
     spreading_scene,
     square_scene,
 )
-from gns_model.data.flume_scenes import barrier_scene, flume_scene, layout_scene, random_scene
+from gns_model.data.flume_scenes import (
+    bare_scene,
+    barrier_scene,
+    flume_scene,
+    layout_scene,
+    random_scene,
+)
 from gns_model.errors import SceneError
 from gns_model.scene import Scene
 
@@ -65,6 +72,7 @@ FAMILIES: dict[str, Callable[[np.random.Generator, int], Scene]] = {
     "spreading-friction": spreading_friction_scene,
     "pressed": pressed_scene,
     "pressed-friction": pressed_friction_scene,
+    "bare": bare_scene,
 }
 
 

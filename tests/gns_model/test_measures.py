@@ -213,6 +213,22 @@ def test_free_depth_without_placement_lies_downstream_of_the_front(plane_scene: 
     assert counts == [8]
 
 
+def test_the_front_of_fewer_points_is_the_mean_of_many_draws(flume: Scene, trajectory_of):
+    """By drawing; of all points it is the front itself, and of fewer it is less far."""
+    cloud = random_cloud(flume, 3, frames=2)
+    trajectory = trajectory_of(cloud, flume)
+    rng = np.random.default_rng(0)
+    for points in (200, 50):
+        drawn = [cloud[:, rng.random(400) < points / 400, 0].max(axis=1) for _ in range(3000)]
+        found = measures.thinned_front_over_time(trajectory, points)
+        scale = cloud[..., 0].std()
+        np.testing.assert_allclose(found, np.mean(drawn, axis=0), atol=0.005 * scale)
+        assert (found < measures.front_over_time(trajectory)).all()
+    whole = measures.thinned_front_over_time(trajectory, 400)
+    np.testing.assert_allclose(whole, measures.front_over_time(trajectory))
+    np.testing.assert_allclose(measures.thinned_front_over_time(trajectory, 10**6), whole)
+
+
 def test_overtopping_counts_a_point_once(flume: Scene, trajectory_of):
     frames = np.array(
         [

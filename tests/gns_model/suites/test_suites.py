@@ -146,7 +146,7 @@ def test_the_flume_of_the_solver_and_of_a_coarser_one(short_flume, tmp_path: Pat
     setup = Setup(tmp_path, spacing=0.05)
     same = flume.run(MpmSimulator(spacing=0.05), setup)
     assert all(row["error"] == row["most_off"] == 0.0 for row in same.rows)
-    assert [aim.met for aim in same.aims] == [True] * 4
+    assert [aim.met for aim in same.aims] == [True] * 5
     assert same.facts["points_inside_baffles"] == 0
     assert same.facts["row_1_arrival"] < same.facts["row_2_arrival"]
     assert is_png(tmp_path / "flume.png")
