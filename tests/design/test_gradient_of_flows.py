@@ -12,9 +12,10 @@ from gns_model.simulator import load_simulator
 
 @pytest.mark.slow
 def test_the_gradient_of_a_whole_flow_says_what_a_move_does(small_flume):
-    """Measured: 0.89 with one start, 0.93 with the mean of two, three times and twice as long as the
-    differences; 0.92 and 0.96 before the model was trained through whole flows. A flow of 650 grains over 20 steps
-    is too tame to tell shared adjoints from exact ones: `benchmarks/gradients.py` does that."""
+    """Measured: 0.89 with one start, 0.93 with the mean of two, three times and twice as long as
+    the differences; 0.92 and 0.96 before the model was trained through whole flows. A flow of 650
+    grains over 20 steps is too tame to tell shared adjoints from exact ones:
+    `benchmarks/gradients.py` does that."""
     scene = small_flume.replace(duration=0.4)
     travel = Objective(depth_weight=0.0)
     task = BaffleTask(scene, load_simulator("baffle-lite"), n_baffles=1, objective=travel)
