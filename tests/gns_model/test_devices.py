@@ -8,7 +8,7 @@ sum of it with one that is on the CPU fails, as it would between CPU and GPU.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 
 import numpy as np
 import pytest
@@ -22,6 +22,7 @@ from gns_model.mpm.torch_solver import TorchMpmSimulator
 from gns_model.scene import Scene
 from gns_model.smooth_measures import smooth_measures
 from gns_model.training.batches import collate
+from gns_model.training.flows import flow_gradient
 from gns_model.training.loss import Emphasis, unrolled_loss
 
 MODELS = {
@@ -133,6 +134,18 @@ def test_a_training_loss_says_where(backprop, flows):
         loss = unrolled_loss(net, batch, emphasis, steps=2, backprop=backprop, return_steps=8)
         loss.backward()
     assert loss.item() > 0
+
+
+def test_the_error_of_a_whole_flow_says_where(flows):
+    net = model(3, {"depth_range": 0.1, "dt": 0.02})
+    windows = WindowIndex([flows], spacing=0.05, dt=0.02, history=3)
+    assert windows.sources[0].scene.baffles
+    with default_elsewhere():
+        found = flow_gradient(
+            net, [windows.read(k, 0, unroll=2) for k in (0, 1)], list(net.parameters()),
+            clip_norm=1.0, context=nullcontext(), device=torch.device("cpu"),
+        )  # fmt: skip
+    assert found.item() > 0
 
 
 @pytest.mark.parametrize("dim", [2, 3])
