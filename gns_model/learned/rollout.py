@@ -136,36 +136,62 @@ def roll_out_tensor(
         for history, shift, n in zip(histories, noise, moving, strict=True):
             history[:n] += shift.to(history)[:, None]
     world = _world(scenes, starts, model, **poses)
-    depth = config.history + 1
-
-    def step(*past: Tensor) -> Tensor:
-        return model.step(torch.stack(past, dim=1), world)
-
     begun = len(starts[0].known)
     if any(len(s.known) != begun for s in starts) or min(lengths) < begun:
         raise SimulatorError(
             f"the first {model.config.solver_steps} steps are the solver's: no scene may be shorter"
         )
-    track = list(torch.cat(histories).unbind(1))
-    for _ in range(begun, max(lengths)):
-        past = track[-depth:]
-        if checkpoint and torch.is_grad_enabled():
-            track.append(rematerialise(step, *past, use_reentrant=False))
-        else:
-            track.append(step(*past))
-        if limit is not None or smoothing:
-            counts = [len(h) for h in histories]
-            track[-1] = FilterAdjoint.apply(
-                track[-1], counts, world.moving, limit, smoothing, config.radius
-            )
+    counts = [len(h) for h in histories]
+    steps = max(lengths) - begun
+    rolled = unrolled(
+        model, torch.cat(histories), world, counts, steps, limit, smoothing, checkpoint=checkpoint
+    )
     # Kinematic points stand still, so any frame of theirs will do for the first ones.
     first = [
         torch.cat([s.known, h[s.rows :, -1].expand(begun, -1, -1)], 1)[:-1]
         for s, h in zip(starts, histories, strict=True)
     ]
-    whole = torch.cat([torch.cat(first, dim=1), torch.stack(track[depth - 1 :])])
-    parts = whole.split([len(h) for h in histories], dim=1)
+    whole = torch.cat([torch.cat(first, dim=1), torch.cat(histories)[None, :, -1], rolled])
+    parts = whole.split(counts, dim=1)
     return [p[:t, :n] for p, t, n in zip(parts, lengths, moving, strict=True)]
+
+
+def unrolled(
+    model: LearnedModel,
+    history: Tensor,
+    world: World,
+    counts: Sequence[int],
+    steps: int,
+    limit: float | None,
+    smoothing: float,
+    *,
+    checkpoint: bool = True,
+) -> Tensor:
+    """Positions after each of `steps` steps [m], shape (steps, N, D), for autograd.
+
+    Args:
+        history: shape (N, H + 1, D) [m].
+        counts: points of each scene.
+        limit, smoothing: of the adjoints, see `adjoint`.
+        checkpoint: compute every step again in the backward pass.
+    """
+    track, depth = list(history.unbind(1)), model.config.history + 1
+
+    def step(*past: Tensor) -> Tensor:
+        return model.step(torch.stack(past, dim=1), world)
+
+    for _ in range(steps):
+        past = track[-depth:]
+        if checkpoint and torch.is_grad_enabled():
+            after = rematerialise(step, *past, use_reentrant=False)
+        else:
+            after = step(*past)
+        if limit is not None or smoothing:
+            after = FilterAdjoint.apply(
+                after, counts, world.moving, limit, smoothing, model.config.radius
+            )
+        track.append(after)
+    return torch.stack(track[depth:]) if steps else history.new_zeros((0, *history[:, -1].shape))
 
 
 def place(model: LearnedModel) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -102,9 +103,22 @@ def draw(
             break
         draws.append(Draw(source, frame, mixture, flip, edges, half))
         total += edges
-    parts: list[list[Draw]] = [[] for _ in range(ranks)]
-    for item in sorted(draws, key=lambda d: -d.edges):
-        min(parts, key=lambda part: sum(d.edges for d in part)).append(item)
+    return deal(draws, ranks)
+
+
+class _Heavy(Protocol):
+    @property
+    def edges(self) -> float: ...
+
+
+Item = TypeVar("Item", bound=_Heavy)
+
+
+def deal(items: Sequence[Item], ranks: int) -> list[list[Item]]:
+    """Share `items` out, the largest first, each to the rank that has the fewest edges."""
+    parts: list[list[Item]] = [[] for _ in range(ranks)]
+    for item in sorted(items, key=lambda one: -one.edges):
+        min(parts, key=lambda part: sum(one.edges for one in part)).append(item)
     return parts
 
 
