@@ -53,6 +53,7 @@ class Family(StrEnum):
     pressed = "pressed"
     pressed_friction = "pressed-friction"
     bare = "bare"
+    rows = "rows"
 
 
 @app.command()

@@ -94,13 +94,33 @@ def smooth_upstream_depth(
     yaws: float | Tensor = 0.0,
     temperature: float = TEMPERATURE,
 ) -> Tensor:
-    """Soft maximum over frames and baffles of the depth just upstream of a baffle [m].
+    """Soft maximum over frames and baffles of `smooth_depth_over_time` [m], a scalar.
+
+    With no baffles it is the hard depth of the free flow, a constant.
+    """
+    if len(centres) == 0:
+        return _free_depth(positions, scene, point_volume)
+    depth = smooth_depth_over_time(
+        positions, scene, centres, sizes, point_volume, yaws=yaws, temperature=temperature
+    )
+    return smooth_maximum(depth.flatten(), _MAXIMUM * temperature)
+
+
+def smooth_depth_over_time(
+    positions: Tensor,
+    scene: Scene,
+    centres: Tensor,
+    sizes: Sequence[float] | Tensor,
+    point_volume: float,
+    *,
+    yaws: float | Tensor = 0.0,
+    temperature: float = TEMPERATURE,
+) -> Tensor:
+    """Depth just upstream of every baffle in every frame [m], shape (T, B).
 
     The window of `measures.upstream_depth_over_time` gets sigmoid edges, its quantile becomes a
     soft one, and its least filling a sigmoid gate. See `smooth_measures` for the arguments.
     """
-    if len(centres) == 0:
-        return _free_depth(positions, scene, point_volume)
     # Frame by frame and baffle by baffle, (T, B, N): 1.1 million numbers for a coarse flume.
     weight = window_weights(positions, centres, sizes, _EDGE * temperature, yaws=yaws)
     size = torch.as_tensor(sizes, dtype=positions.dtype, device=positions.device)
@@ -115,10 +135,9 @@ def smooth_upstream_depth(
     # The phantom keeps the quantile of an empty window defined: it lies on the base.
     height = torch.cat([height, torch.zeros_like(height[..., :1])], dim=-1)
     weight = torch.cat([weight, torch.full_like(weight[..., :1], _PHANTOM)], dim=-1)
-    depth = gate * smooth_quantile(
+    return gate * smooth_quantile(
         height, measures.DEPTH_QUANTILE, _QUANTILE * temperature, weights=weight
     )
-    return smooth_maximum(depth.flatten(), _MAXIMUM * temperature)
 
 
 def smooth_overtopping(

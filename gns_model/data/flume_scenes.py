@@ -104,6 +104,28 @@ def flume_scene(rng: np.random.Generator, index: int) -> Scene:
     )
 
 
+def row_scene(rng: np.random.Generator, index: int) -> Scene:
+    """A scene of the family "rows". Within a row the gaps are alike, but for a finger's width."""
+    values = _flume(*_varied(rng), rng.uniform(1.6, 2.4))
+    low, high = (values["domain"][k][2] for k in ("lower", "upper"))
+    size = (rng.uniform(0.1, 0.2), rng.uniform(0.22, 0.36), rng.uniform(0.1, 0.25))
+    placed: list[dict] = []
+    x = rng.uniform(0.62, 0.95)
+    for _ in range(int(rng.integers(1, 3))):
+        pitch = size[2] + rng.uniform(0.05, 0.15)
+        fit = int((high - low + pitch - size[2]) / pitch)
+        count = int(rng.integers(2, min(fit, 6) + 1))
+        room = high - low - (count - 1) * pitch - size[2]
+        first = low + size[2] / 2 + rng.uniform(0, room)
+        for k in range(count):
+            z = np.clip(
+                first + k * pitch + rng.uniform(-0.01, 0.01), low + size[2] / 2, high - size[2] / 2
+            )
+            placed.append({"center": (x + rng.uniform(-0.02, 0.02), z), "size": size})
+        x += size[0] + rng.uniform(0.15, 0.4)
+    return Scene.from_dict({**values, "baffle": placed})
+
+
 def layout_scene(rng: np.random.Generator, index: int) -> Scene:
     """A scene of the family "layouts"."""
     return _with_random_baffles(

@@ -22,12 +22,14 @@ and for what the paper's aspect ratios ask of a model that has seen aspect 1 onl
     pressed-friction
                 2D: the same at the five angles in turn
 
-and four that are made for layouts of baffles in the flume:
+and five that are made for layouts of baffles in the flume:
 
     random   domain, release (size, place, height of fall, velocity) and one to four baffles of
              random size and place: the paper's barrier dataset, widened
     flume    the paper's flume with a release varied by some 15% and one to six random baffles
     bare     the same releases without baffles: what every layout is compared with
+    rows     the same releases and one or two rows of two to six equal baffles with gaps of 0.03 to
+             0.17 m: what searches end at, and random layouts hardly ever are
     layouts  the paper's flume exactly, with three of its own baffles placed at random: unseen
              layouts to choose and to judge a model by
 """
@@ -54,6 +56,7 @@ from gns_model.data.flume_scenes import (
     flume_scene,
     layout_scene,
     random_scene,
+    row_scene,
 )
 from gns_model.errors import SceneError
 from gns_model.scene import Scene
@@ -73,6 +76,7 @@ FAMILIES: dict[str, Callable[[np.random.Generator, int], Scene]] = {
     "pressed": pressed_scene,
     "pressed-friction": pressed_friction_scene,
     "bare": bare_scene,
+    "rows": row_scene,
 }
 
 

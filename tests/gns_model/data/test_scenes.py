@@ -72,3 +72,21 @@ def test_a_third_of_what_spreads_at_five_frictions_is_at_rest():
     scenes = [draw("spreading-friction", 0, k) for k in range(60)]
     assert 10 < sum(not any(map(any, (b.velocity for b in s.releases))) for s in scenes) < 30
     assert {s.material.friction_angle for s in scenes} == {15.0, 22.5, 30.0, 37.5, 45.0}
+
+
+def test_rows_are_tight_and_straight():
+    scenes = [draw("rows", 0, k) for k in range(100)]
+    for scene in scenes:
+        first = min(b.center[0] for b in scene.baffles)
+        rows = [
+            [b for b in scene.baffles if (b.center[0] - first < 0.05) == near] for near in (1, 0)
+        ]
+        for row in filter(None, rows):
+            assert 2 <= len(row) <= 6
+            x, z = np.array(sorted((b.center for b in row), key=lambda c: c[1])).T
+            gaps = np.diff(z) - row[0].size[2]
+            assert 0.029 < gaps.min() <= gaps.max() < 0.171
+            assert np.ptp(gaps) < 0.041
+            assert np.ptp(x) <= 0.04
+            assert z[0] - row[0].size[2] / 2 >= 0.1 - 1e-9  # within the walls
+            assert z[-1] + row[0].size[2] / 2 <= 1.9 + 1e-9

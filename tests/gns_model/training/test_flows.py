@@ -13,7 +13,13 @@ from gns_model.data.windows import WindowIndex
 from gns_model.learned.config import ModelConfig
 from gns_model.learned.model import LearnedModel
 from gns_model.training import Recipe, batches, flows, train
-from gns_model.training.flows import draw_flows, flow_error, flow_gradient
+from gns_model.training.flows import (
+    depth_error,
+    draw_flows,
+    flow_error,
+    flow_gradient,
+    mass_error,
+)
 from gns_model.training.statistics import measure
 
 SPACING, DT, RADIUS = 0.0625, 0.02, 0.1
@@ -124,6 +130,49 @@ def test_the_depth_upstream_of_a_baffle_counts(window, monkeypatch):
         return float(flow_error(model(), replace(window, scene=moved), CPU))
 
     assert error((x + 0.05 + size[0] / 2, z)) > 1.02 * error((0.7, 0.75))
+
+
+def test_a_heap_that_never_slumps_again_is_an_error(window):
+    """It has the same peak. And one that is as much too low counts as much."""
+    scene = window.scene
+    [baffle] = scene.baffles
+    face = baffle.center[0] - baffle.size[0] / 2
+    rng = np.random.default_rng(0)
+    x = rng.uniform(face - 0.05, face, 2000)
+    z = rng.uniform(-0.5, 0.5, 2000) * baffle.size[2] + baffle.center[1]
+    height = 0.2 * rng.uniform(0, 1, 2000)
+
+    def heap(*depths):
+        """Frames (N, K, 3) with these depths as shares of the first."""
+        frames = [np.stack([x, scene.base + share * height, z], 1) for share in depths]
+        return torch.from_numpy(np.stack(frames, 1))
+
+    slumps = heap(1.0, 0.75, 0.5)
+    error = depth_error(heap(1.0, 1.0, 1.0), slumps, scene, SPACING)
+    expected = np.array([0, 0.25, 0.5]) * flows.FRONT_AIM / flows.DEPTH_AIM
+    # The top of a point is half a spacing above it, the same in both.
+    assert error.sqrt().numpy() == pytest.approx(expected, rel=0.1, abs=1e-9)
+    assert float(depth_error(slumps, slumps, scene, SPACING).max()) == 0
+    low = depth_error(heap(1.0, 0.5, 0.0), slumps, scene, SPACING)[1]
+    assert float(low) == pytest.approx(float(error[1]), rel=0.05)
+
+
+def test_a_shift_of_the_whole_mass_costs_more_than_as_wide_a_scatter():
+    """The same squares of the coordinates, in one direction or in both."""
+    rng = np.random.default_rng(0)
+    begun = torch.from_numpy(rng.uniform(0, 1, (400, 3)))
+    true = (begun + torch.tensor([0.5, 0, 0]))[:, None]
+    order = true[:, 0, 0].argsort().argsort()
+    push = torch.zeros_like(true)
+    push[..., 0] = 1e-7
+    scatter = push * torch.where(order % 2 == 0, 1.0, -1.0)[:, None, None]
+    shifted, scattered = (
+        float(mass_error(true + p, true, begun, SPACING).sqrt()) for p in (push, scatter)
+    )
+    # Of the shift: body, front and centroid, whose way is that of all.
+    weight = flows.FRONT_AIM / flows.CENTROID_AIM
+    assert shifted == pytest.approx(1e-7 / 0.5 * np.sqrt(2 + weight**2), rel=1e-3)
+    assert scattered == pytest.approx(1e-7 / 0.5, rel=0.05)
 
 
 def test_its_gradient_is_that_of_differences(window, monkeypatch):
