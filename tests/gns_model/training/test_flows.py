@@ -14,6 +14,7 @@ from gns_model.learned.config import ModelConfig
 from gns_model.learned.model import LearnedModel
 from gns_model.training import Recipe, batches, flows, train
 from gns_model.training.flows import (
+    crowding_error,
     depth_error,
     draw_flows,
     flow_error,
@@ -173,6 +174,37 @@ def test_a_shift_of_the_whole_mass_costs_more_than_as_wide_a_scatter():
     weight = flows.FRONT_AIM / flows.CENTROID_AIM
     assert shifted == pytest.approx(1e-7 / 0.5 * np.sqrt(2 + weight**2), rel=1e-3)
     assert scattered == pytest.approx(1e-7 / 0.5, rel=0.05)
+
+
+def test_grains_that_sink_into_each_other_are_seen():
+    """A lattice, and the same lattice with every grain moved onto its neighbour: nearly the same
+    coordinates, twice the density. Points in one place have a finite gradient."""
+    grid = torch.stack(
+        torch.meshgrid(*[torch.arange(8.0, dtype=torch.float64)] * 3, indexing="ij"), -1
+    )
+    true = grid.reshape(-1, 1, 3)
+    paired = true.clone()
+    paired[..., 1] = 2 * torch.floor(paired[..., 1] / 2) + 0.5
+    paired.requires_grad_()
+    scale, radius = flows.FRONT_AIM / flows.CROWDING_AIM, 1.2
+    error = crowding_error(paired, true, radius)
+    # Each has one neighbour at distance 0; nobody had any nearer than 1, and 6 of those at most.
+    least = 1 - 6 * (1 - 1 / radius) ** 2
+    assert float(error.detach()) > (scale * least / 0.25) ** 2
+    [gradient] = torch.autograd.grad(error, paired)
+    assert gradient.isfinite().all()
+    assert float(crowding_error(true, true, radius)) == 0
+
+
+def test_what_is_too_crowded_is_pushed_apart():
+    """Down the gradient the error falls."""
+    rng = np.random.default_rng(0)
+    true = torch.from_numpy(rng.uniform(0, 1, (300, 2, 3)))
+    tight = (0.8 * true).requires_grad_()
+    error = crowding_error(tight, true, 0.2)
+    [gradient] = torch.autograd.grad(error, tight)
+    step = tight.detach() - 1e-3 * gradient / gradient.norm() * len(true) ** 0.5
+    assert float(crowding_error(step, true, 0.2)) < 0.99 * float(error.detach())
 
 
 def test_its_gradient_is_that_of_differences(window, monkeypatch):
