@@ -9,9 +9,10 @@ from __future__ import annotations
 import contextlib
 import signal
 import sys
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, NoReturn, TextIO
 
 from gns_model.errors import GnsError
 from gns_model.interrupts import none_lost
@@ -66,7 +67,8 @@ def main(app: Typer, name: str, arguments: list[str] | None = None) -> NoReturn:
     """
     signal.signal(signal.SIGTERM, _interrupt)
     try:
-        with clean_errors(), none_lost():
+        with clean_errors(), none_lost(), warnings.catch_warnings():
+            warnings.showwarning = _show_warning
             code = _run(app, name, arguments)
             if code == INTERRUPTED:  # typer swallows the interrupt and returns its code
                 raise KeyboardInterrupt
@@ -96,6 +98,21 @@ def _run(app: Typer, name: str, arguments: list[str] | None) -> object:
             print(message, file=sys.stderr)
             raise SystemExit(USER_ERROR) from None
         fail(f"{message} (see {name} --help)")
+
+
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    """A warning for the user is one line; of a library's own the place matters, too."""
+    text = " ".join(str(message).split())
+    if category is not UserWarning:
+        text = f"{text} ({category.__name__}, {filename}:{lineno})"
+    print("warning: " + text, file=file or sys.stderr)
 
 
 def _interrupt(signum: int, frame: object) -> NoReturn:

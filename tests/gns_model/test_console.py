@@ -2,6 +2,7 @@ import errno
 import os
 import subprocess
 import sys
+import warnings
 
 import pytest
 import typer
@@ -125,6 +126,24 @@ def test_a_quiet_bar_prints_nothing(capsys):
         bar.advance(bar.add_task("x", total=1))
     captured = capsys.readouterr()
     assert captured.out + captured.err == ""
+
+
+def test_a_warning_is_one_line_and_the_place_is_told_of_a_librarys_own_only(capsys):
+    app = typer.Typer()
+
+    @app.command()
+    def run():
+        warnings.simplefilter("always")
+        warnings.warn("outside of what\nit knows", stacklevel=1)
+        warnings.warn("gone soon", DeprecationWarning, stacklevel=1)
+
+    before = warnings.showwarning
+    with pytest.raises(SystemExit):
+        console.main(app, "tool", [])
+    ours, theirs = capsys.readouterr().err.splitlines()
+    assert ours == "warning: outside of what it knows"
+    assert theirs.startswith(f"warning: gone soon (DeprecationWarning, {__file__}:")
+    assert warnings.showwarning is before
 
 
 def test_an_interrupt_within_exec_has_the_same_code(tmp_path):
