@@ -51,6 +51,10 @@ class Recipe(BaseModel):
     steps: Count | None = None  #: optimiser steps, or ...
     minutes: Positive | None = None  #: ... time to spend, earlier runs that it resumes included
     edges_per_batch: Count = 60_000  #: of one rank; a batch holds at least one window
+    #: "adam", or "descent": plain steps along the running mean of the clipped gradients, of
+    #: `learning_rate` in length where all agree. For `flow_share`: the gradient of a flow lies in
+    #: few directions, and Adam makes a step in all of the rest, too.
+    optimiser: Literal["adam", "descent"] = "adam"
     learning_rate: Positive = 2e-3
     #: "cosine": warm-up, then to zero at the end of the budget. "exponential": the paper's,
     #: tenfold lower every `decay_steps`.

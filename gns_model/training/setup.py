@@ -88,17 +88,22 @@ def _check_fits(model: ModelConfig, source: Source) -> None:
 
 #: What of a model's configuration the weights do not depend on: it may change on the way.
 FREE = {"noise_std", "subcells", "bounds", "solver_steps"}
+#: Of the running mean of the gradients, for "descent": the mean of about ten steps.
+MOMENTUM = 0.9
 
 
 def check_resumable(recipe: Recipe, position: Position) -> None:
-    """Refuse to go on with another network or seed; budget, rate, data and noise may change.
+    """Refuse to go on with another network, optimiser or seed.
+
+    Budget, rate, data and noise may change.
 
     Raises:
         RecipeError: naming the first key that differs.
     """
-    wanted = {**recipe.model.model_dump(mode="json", exclude=FREE), "seed": recipe.seed}
+    wanted = {**_architecture(recipe), "seed": recipe.seed}
+    wanted = {key: value for key, value in wanted.items() if key not in FREE}
     # A state that is older than an option was trained with its default.
-    found = {**ModelConfig().model_dump(mode="json"), **position.architecture}
+    found = {**ModelConfig().model_dump(mode="json"), "optimiser": "adam", **position.architecture}
     found["seed"] = position.seed
     for key in wanted:
         if wanted[key] != found.get(key):
@@ -108,14 +113,29 @@ def check_resumable(recipe: Recipe, position: Position) -> None:
             )
 
 
+def _architecture(recipe: Recipe) -> dict[str, Any]:
+    """What a state is a state of."""
+    return {**recipe.model.model_dump(mode="json"), "optimiser": recipe.optimiser}
+
+
 @dataclass
 class Run:
     """What changes from step to step."""
 
     model: LearnedModel
     average: MovingAverage
-    optimiser: torch.optim.AdamW
+    optimiser: torch.optim.Optimizer
     position: Position
+
+
+def optimiser_of(recipe: Recipe, model: LearnedModel) -> torch.optim.Optimizer:
+    """What `recipe.optimiser` names, for all weights of the model."""
+    weights, rate, decay = model.parameters(), recipe.learning_rate, recipe.weight_decay
+    if recipe.optimiser == "descent":
+        return torch.optim.SGD(
+            weights, lr=rate, weight_decay=decay, momentum=MOMENTUM, dampening=MOMENTUM
+        )
+    return torch.optim.AdamW(weights, lr=rate, weight_decay=decay)
 
 
 def begin(recipe: Recipe, data: WindowIndex, state_file: Path, ranks: Ranks, resume: bool) -> Run:
@@ -131,9 +151,7 @@ def begin(recipe: Recipe, data: WindowIndex, state_file: Path, ranks: Ranks, res
     config = recipe.model.model_copy(update={"limits": limits})
     model = LearnedModel(config).to(ranks.device)
     average = MovingAverage(model, recipe.ema_decay)
-    optimiser = torch.optim.AdamW(
-        model.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay
-    )
+    optimiser = optimiser_of(recipe, model)
     there = resume and ranks.rank == 0 and state_file.exists()
     content = ranks.share(state_file.read_bytes() if there else None)
     if content:
@@ -152,8 +170,7 @@ def begin(recipe: Recipe, data: WindowIndex, state_file: Path, ranks: Ranks, res
             kinematic=kinematic_spacing(config),
             seed=recipe.seed,
         )
-        architecture = recipe.model.model_dump(mode="json")
-        measured = Position(0, 0.0, None, 0.0, 0.0, statistics, architecture, recipe.seed)
+        measured = Position(0, 0.0, None, 0.0, 0.0, statistics, _architecture(recipe), recipe.seed)
     position = Position.from_json(ranks.share(measured.to_json().encode() if measured else None))
     position.statistics.apply(model)
     if recipe.start_from is not None:

@@ -72,7 +72,7 @@ def save_state(
     position: Position,
     model: LearnedModel,
     average: MovingAverage,
-    optimiser: torch.optim.AdamW,
+    optimiser: torch.optim.Optimizer,
 ) -> None:
     """Write the state whole: under a temporary name, then renamed."""
     tensors = {f"model.{k}": v for k, v in model.state_dict().items()}
@@ -124,7 +124,7 @@ def restore(
     tensors: dict[str, Tensor],
     model: LearnedModel,
     average: MovingAverage,
-    optimiser: torch.optim.AdamW,
+    optimiser: torch.optim.Optimizer,
     path: Path,
 ) -> None:
     """Put the tensors of a state where they belong; `path` is for messages.

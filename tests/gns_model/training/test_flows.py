@@ -209,8 +209,8 @@ def test_what_is_too_crowded_is_pushed_apart():
 
 def test_its_gradient_is_that_of_differences(window, monkeypatch):
     """In float64 with nothing limited or shared, over eight steps; the limits are another test."""
-    monkeypatch.setattr(flows, "ADJOINT_LIMIT", None)
-    monkeypatch.setattr(flows, "ADJOINT_SMOOTHING", 0.0)
+    monkeypatch.setattr(flows, "LIMIT", None)
+    monkeypatch.setattr(flows, "SMOOTHING", 0.0)
     net = model().double()
     weights = (
         [net.network.decode[-1].bias]

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
@@ -89,8 +90,9 @@ def test_the_best_model_is_kept(tiny, tmp_path):
         {},
         {"replay": 5, "replay_steps": 3, "return_steps": 4, "unroll_fraction": 1.0},
         {"flow_share": 0.7, "flow_steps": 4, "flow_edges": 3000, "unroll_fraction": 1.0},
+        {"optimiser": "descent", "learning_rate": 0.1},
     ],
-    ids=["windows", "replay", "flows"],
+    ids=["windows", "replay", "flows", "descent"],
 )
 def test_resume_is_bit_exact_after_a_signal(tiny, tmp_path, monkeypatch, same_state, options):
     """Six steps at once, and three, SIGTERM, three: the same weights, average and moments."""
@@ -115,6 +117,35 @@ def test_resume_is_bit_exact_after_a_signal(tiny, tmp_path, monkeypatch, same_st
     assert same_state(tmp_path / "whole", tmp_path / "parts")
 
 
+def test_descent_moves_the_weights_by_its_rate_where_all_agree(tiny, tmp_path):
+    """At once, as the mean of one gradient is that one; no longer, however steep the loss."""
+    recipe = Recipe.from_dict(
+        {
+            **tiny,
+            "valid": [],
+            "optimiser": "descent",
+            "learning_rate": 0.05,
+            "clip_norm": 1e-3,  # every gradient is steeper
+            "schedule": "exponential",
+            "warmup": 0.0,
+            "weight_decay": 0.0,
+        }
+    )
+
+    def weights(steps):
+        out = tmp_path / str(steps)
+        train(recipe.model_copy(update={"steps": steps}), out)
+        tensors = load_file(out / "state.safetensors")
+        names = sorted(k for k in tensors if k.startswith("model.") and "mean" not in k)
+        return np.concatenate([tensors[k].numpy().ravel() for k in names if "std" not in k])
+
+    one, two, three = (weights(k) for k in (1, 2, 3))
+    length = 0.05 * 1e-3
+    assert np.linalg.norm(two - one) <= 1.001 * length
+    assert np.linalg.norm(three - two) <= 1.001 * length
+    assert np.linalg.norm(three - one) > 1.5 * length  # these two agree
+
+
 def test_starting_anew_forgets_the_state(tiny, tmp_path, same_state):
     recipe = Recipe.from_dict({**tiny, "valid": []})
     assert train(recipe, tmp_path / "a") == tmp_path / "a" / "last"
@@ -135,7 +166,13 @@ def test_a_finished_run_is_left_as_it_is(tiny, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "change", [{"seed": 1}, {"model": {"radius": 0.11}}, {"model": {"latent": 16}}]
+    "change",
+    [
+        {"seed": 1},
+        {"optimiser": "descent"},
+        {"model": {"radius": 0.11}},
+        {"model": {"latent": 16}},
+    ],
 )
 def test_a_state_of_another_run_is_refused(tiny, tmp_path, change):
     train(Recipe.from_dict({**tiny, "valid": [], "steps": 1}), tmp_path)
