@@ -60,6 +60,10 @@ FROM_START = 0.8
 #: Of the adjoints, see `learned.adjoint`: weights see all grains, so less has to be shared than for
 #: the move of a baffle, and fewer grains may shout.
 LIMIT, SMOOTHING = 2.0, 0.1
+#: Of `agreement`. A step of 0.012 along the direction of 16 flows changes the mean error of ten
+#: others, 0.400, by -0.050 and -0.018 (two drawings) at 0.1, -0.057 and -0.032 at 0.5, -0.069 and
+#: -0.051 at 2; the best step along the mean gradient, 0.004, by -0.029 and -0.027.
+RIDGE = 2.0
 
 
 @dataclass(frozen=True)
@@ -119,33 +123,62 @@ def flow_gradient(
     context: AbstractContextManager[object],
     device: torch.device,
 ) -> Tensor:
-    """Mean error of flows, a scalar; its gradient is left in `parameters`.
+    """Mean error of flows, a scalar; what they agree on is left in `parameters` as the gradient.
 
-    A flow that hangs on few grains has a gradient many times the usual one, and all flows vote: no
-    flow's gradient is longer than `clip_norm`.
+    Its direction is that of `agreement`, its length the mean of those of the flows, of which none
+    counts as more than `clip_norm`: a flow that hangs on few grains has a gradient many times the
+    usual one.
 
     Args:
         windows: where each flow begins, with as many frames of the future as it is to be rolled.
         context: autocast, or nothing.
     """
-    sums = [torch.zeros_like(p) for p in parameters]
-    total = torch.zeros((), device=device)
+    errors, gradients = [], []
     for window in windows:
         with context:
             error = flow_error(model, window, device)
         parts = torch.autograd.grad(error, parameters, allow_unused=True)
-        found = [p for p in parts if p is not None]
-        norm = torch.stack([p.square().sum() for p in found]).sum().sqrt()
-        scale = (clip_norm / norm.clamp_min(1e-12)).clamp(max=1.0) / len(windows)
-        for own, part in zip(sums, parts, strict=True):
-            if part is not None:
-                own += scale * part
-        total += error.detach() / len(windows)
-        del error, parts, found
+        flat = [
+            (torch.zeros_like(p) if part is None else part).flatten()
+            for p, part in zip(parameters, parts, strict=True)
+        ]
+        errors.append(error.detach())
+        gradients.append(torch.cat(flat))
+        del error, parts, flat
         release_heap()  # a rank grew to 9 GB in a dozen flows of the flume, of which it used 1
-    for parameter, own in zip(parameters, sums, strict=True):
-        parameter.grad = own
-    return total
+    error, gradient = torch.stack(errors), torch.stack(gradients)
+    length = gradient.norm(dim=1).clamp(max=clip_norm).mean()
+    found = length * agreement(gradient, error)
+    sizes = [p.numel() for p in parameters]
+    for parameter, part in zip(parameters, found.split(sizes), strict=True):
+        parameter.grad = part.view_as(parameter)
+    return error.mean()
+
+
+def agreement(gradients: Tensor, errors: Tensor) -> Tensor:
+    """The direction against which all flows get better, each by about its own error; length 1.
+
+    The mean of the gradients will not do: nine tenths of each lie in one direction, "farther or
+    less far", about which flows that go too far and flows that stop too early disagree, and what
+    is left is what most say at the cost of the rest. With unit gradients u_i and C_ij = u_i · u_j,
+
+        d = sum_i a_i u_i,  (C + RIDGE I) a = errors / (their mean),
+
+    a regularised Gauss-Newton step for the errors as residuals: sixteen flows of `column-2d` that
+    agree to nine in ten on nothing but the mean gradient all get better along d.
+
+    Args:
+        gradients: shape (n, P); one that is not finite makes the direction so.
+        errors: shape (n,).
+    """
+    norm = gradients.norm(dim=1, keepdim=True)
+    if not norm.isfinite().all():
+        return gradients.sum(0)
+    unit = gradients / norm.clamp_min(1e-12)
+    wanted = errors / errors.mean().clamp_min(1e-12)
+    ridge = RIDGE * torch.eye(len(unit), dtype=unit.dtype, device=unit.device)
+    direction = torch.linalg.solve(unit @ unit.T + ridge, wanted.to(unit.dtype)) @ unit
+    return direction / direction.norm().clamp_min(1e-12)
 
 
 def flow_error(model: LearnedModel, window: Window, device: torch.device) -> Tensor:

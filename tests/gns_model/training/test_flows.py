@@ -14,6 +14,7 @@ from gns_model.learned.config import ModelConfig
 from gns_model.learned.model import LearnedModel
 from gns_model.training import Recipe, batches, flows, train
 from gns_model.training.flows import (
+    agreement,
     crowding_error,
     depth_error,
     draw_flows,
@@ -249,6 +250,43 @@ def test_a_step_down_the_gradient_makes_flows_better(slides):
                 p -= 0.5 * p.grad
         last = float(descend())
     assert last < 0.9 * first
+
+
+def test_agreement_is_where_all_get_better(monkeypatch):
+    """Three say "farther" along one axis and one the contrary; each has a little of its own."""
+    rng = np.random.default_rng(0)
+    gradients = torch.zeros(4, 50, dtype=torch.float64)
+    gradients[:, 0] = torch.tensor([1.0, 1.0, 1.0, -1.0])
+    gradients[:, 1:] = 0.1 * torch.from_numpy(rng.normal(size=(4, 49)))
+    scales = torch.tensor([1.0, 30.0, 0.1, 5.0], dtype=torch.float64)
+    unit = gradients / gradients.norm(dim=1, keepdim=True)
+    mean = unit.mean(0) / unit.mean(0).norm()
+
+    def worst():
+        """What a step does for the flow that it helps least."""
+        direction = agreement(gradients * scales[:, None], torch.ones(4))
+        assert float(direction.norm()) == pytest.approx(1)
+        return float((unit @ direction).min())
+
+    assert float((unit @ mean).min()) < 0
+    assert worst() > float((unit @ mean).min()) + 0.1
+    monkeypatch.setattr(flows, "RIDGE", 0.01)
+    assert worst() > 0.1
+
+
+def test_agreement_asks_more_where_the_error_is_larger():
+    rng = np.random.default_rng(0)
+    gradients = torch.from_numpy(rng.normal(size=(3, 1000)))  # nearly orthogonal
+    direction = agreement(gradients, torch.tensor([1.0, 2.0, 4.0]))
+    parts = (gradients / gradients.norm(dim=1, keepdim=True)) @ direction
+    assert (parts / parts[0]).numpy() == pytest.approx([1, 2, 4], rel=0.2)
+
+
+def test_agreement_of_one_is_its_gradient_and_nothing_finite_comes_of_what_is_not():
+    one = torch.tensor([[3.0, 4.0]])
+    assert agreement(one, torch.tensor([0.2]))[0].item() == pytest.approx(0.6)
+    broken = torch.tensor([[3.0, 4.0], [1.0, float("nan")]])
+    assert not agreement(broken, torch.ones(2)).isfinite().all()
 
 
 def test_no_flow_has_more_than_its_vote(slides):
