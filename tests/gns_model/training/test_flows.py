@@ -114,7 +114,8 @@ def test_a_front_that_lags_is_seen_by_itself(window, monkeypatch):
     way = np.sort(last)[-count:].mean() - np.sort(window.history[:, -1, 0])[-count:].mean()
     travel = np.sort(window.future[:, -1], axis=0) - np.sort(window.history[:, -1], axis=0)
     way = max(way, np.sqrt(np.square(travel).sum(1).mean()), 2 * SPACING)
-    square = lag**2 * (1 + count / len(last)) / way**2
+    weight = (flows.BODY_AIM / flows.FRONT_AIM) ** 2
+    square = lag**2 * (weight + count / len(last)) / way**2
     expected = np.sqrt(square + flows.RIGHT**2) - flows.RIGHT
     assert front == pytest.approx(expected, rel=0.05)
 
@@ -151,7 +152,7 @@ def test_a_heap_that_never_slumps_again_is_an_error(window):
 
     slumps = heap(1.0, 0.75, 0.5)
     error = depth_error(heap(1.0, 1.0, 1.0), slumps, scene, SPACING)
-    expected = np.array([0, 0.25, 0.5]) * flows.FRONT_AIM / flows.DEPTH_AIM
+    expected = np.array([0, 0.25, 0.5]) * flows.BODY_AIM / flows.DEPTH_AIM
     # The top of a point is half a spacing above it, the same in both.
     assert error.sqrt().numpy() == pytest.approx(expected, rel=0.1, abs=1e-9)
     assert float(depth_error(slumps, slumps, scene, SPACING).max()) == 0
@@ -172,8 +173,12 @@ def test_a_shift_of_the_whole_mass_costs_more_than_as_wide_a_scatter():
         float(mass_error(true + p, true, begun, SPACING).sqrt()) for p in (push, scatter)
     )
     # Of the shift: body, front and centroid, whose way is that of all.
-    weight = flows.FRONT_AIM / flows.CENTROID_AIM
-    assert shifted == pytest.approx(1e-7 / 0.5 * np.sqrt(2 + weight**2), rel=1e-3)
+    squares = [
+        1,
+        (flows.BODY_AIM / flows.FRONT_AIM) ** 2,
+        (flows.BODY_AIM / flows.CENTROID_AIM) ** 2,
+    ]
+    assert shifted == pytest.approx(1e-7 / 0.5 * np.sqrt(sum(squares)), rel=1e-3)
     assert scattered == pytest.approx(1e-7 / 0.5, rel=0.05)
 
 
@@ -187,7 +192,7 @@ def test_grains_that_sink_into_each_other_are_seen():
     paired = true.clone()
     paired[..., 1] = 2 * torch.floor(paired[..., 1] / 2) + 0.5
     paired.requires_grad_()
-    scale, radius = flows.FRONT_AIM / flows.CROWDING_AIM, 1.2
+    scale, radius = flows.BODY_AIM / flows.CROWDING_AIM, 1.2
     error = crowding_error(paired, true, radius)
     # Each has one neighbour at distance 0; nobody had any nearer than 1, and 6 of those at most.
     least = 1 - 6 * (1 - 1 / radius) ** 2
