@@ -149,6 +149,24 @@ def test_speed_of_a_small_model(tiny, tmp_path: Path, monkeypatch: pytest.Monkey
     json.dumps(result.to_dict(), allow_nan=False)
 
 
+def test_speed_is_that_of_the_network_where_a_rollout_begins_with_the_solver(
+    tiny, tmp_path, monkeypatch
+):
+    """Three models in this repository do; a short rollout of theirs is the solver's alone."""
+
+    def called(*args):
+        raise AssertionError("the solver's steps are timed")
+
+    monkeypatch.setattr("gns_model.learned.start.solver_frames", called)
+    monkeypatch.setattr(speed, "SIZES", {2: (60,)})
+    simulator = tiny(solver_steps=5)
+    series = speed.series_of(simulator)[:1]
+    monkeypatch.setattr(speed, "series_of", lambda simulator: series)
+    [row] = speed.run(simulator, Setup(tmp_path, budget=20.0)).rows
+    assert row["seconds"] > 0
+    assert simulator.model.config.solver_steps == 5
+
+
 def test_speed_leaves_out_what_the_budget_does_not_hold(tiny, tmp_path, monkeypatch):
     monkeypatch.setattr(speed, "SIZES", {2: (60, 240, 480)})
     series = speed.series_of(tiny())[:1]
