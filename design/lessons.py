@@ -42,8 +42,8 @@ LEARNING_RATE = 5e-5
 FLOW_EDGES = 3_000_000
 
 #: Optimiser steps below which a refinement is not to be trusted: the first steps of an optimiser
-#: that has no moments yet go astray. Eight on four layouts of the flume took the centroid's gap on
-#: three others from 4.4 to 1.9 %.
+#: that has no moments yet go astray. Seven on four layouts of the flume took the centroid's gap on
+#: three others from 3.6 to 1.2 %.
 FEW = 5
 
 #: What one process of the training takes with a batch of one flume, heap included [bytes].
