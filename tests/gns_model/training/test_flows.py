@@ -12,15 +12,13 @@ import torch
 from gns_model.data.windows import WindowIndex
 from gns_model.learned.config import ModelConfig
 from gns_model.learned.model import LearnedModel
-from gns_model.training import Recipe, batches, flows, train
+from gns_model.training import Recipe, batches, flow_errors, flows, train
+from gns_model.training.flow_errors import crowding_error, depth_error, mass_error
 from gns_model.training.flows import (
     agreement,
-    crowding_error,
-    depth_error,
     draw_flows,
     flow_error,
     flow_gradient,
-    mass_error,
 )
 from gns_model.training.statistics import measure
 
@@ -96,7 +94,7 @@ def test_a_front_that_lags_is_seen_by_itself(window, monkeypatch):
     """As many grains off by as much: at the front, and in the middle of the heap. Their way is
     that of the front from the start to the end of the window."""
     last = window.future[:, -1, 0]
-    count = max(1, int(flows.FRONT * len(last)))
+    count = max(1, int(flow_errors.FRONT * len(last)))
     order = torch.from_numpy(np.argsort(last))
     lag = 1e-6  # they keep their order
 
@@ -114,7 +112,7 @@ def test_a_front_that_lags_is_seen_by_itself(window, monkeypatch):
     way = np.sort(last)[-count:].mean() - np.sort(window.history[:, -1, 0])[-count:].mean()
     travel = np.sort(window.future[:, -1], axis=0) - np.sort(window.history[:, -1], axis=0)
     way = max(way, np.sqrt(np.square(travel).sum(1).mean()), 2 * SPACING)
-    weight = (flows.BODY_AIM / flows.FRONT_AIM) ** 2
+    weight = (flow_errors.BODY_AIM / flow_errors.FRONT_AIM) ** 2
     square = lag**2 * (weight + count / len(last)) / way**2
     expected = np.sqrt(square + flows.RIGHT**2) - flows.RIGHT
     assert front == pytest.approx(expected, rel=0.05)
@@ -152,7 +150,7 @@ def test_a_heap_that_never_slumps_again_is_an_error(window):
 
     slumps = heap(1.0, 0.75, 0.5)
     error = depth_error(heap(1.0, 1.0, 1.0), slumps, scene, SPACING)
-    expected = np.array([0, 0.25, 0.5]) * flows.BODY_AIM / flows.DEPTH_AIM
+    expected = np.array([0, 0.25, 0.5]) * flow_errors.BODY_AIM / flow_errors.DEPTH_AIM
     # The top of a point is half a spacing above it, the same in both.
     assert error.sqrt().numpy() == pytest.approx(expected, rel=0.1, abs=1e-9)
     assert float(depth_error(slumps, slumps, scene, SPACING).max()) == 0
@@ -175,8 +173,8 @@ def test_a_shift_of_the_whole_mass_costs_more_than_as_wide_a_scatter():
     # Of the shift: body, front and centroid, whose way is that of all.
     squares = [
         1,
-        (flows.BODY_AIM / flows.FRONT_AIM) ** 2,
-        (flows.BODY_AIM / flows.CENTROID_AIM) ** 2,
+        (flow_errors.BODY_AIM / flow_errors.FRONT_AIM) ** 2,
+        (flow_errors.BODY_AIM / flow_errors.CENTROID_AIM) ** 2,
     ]
     assert shifted == pytest.approx(1e-7 / 0.5 * np.sqrt(sum(squares)), rel=1e-3)
     assert scattered == pytest.approx(1e-7 / 0.5, rel=0.05)
@@ -192,7 +190,7 @@ def test_grains_that_sink_into_each_other_are_seen():
     paired = true.clone()
     paired[..., 1] = 2 * torch.floor(paired[..., 1] / 2) + 0.5
     paired.requires_grad_()
-    scale, radius = flows.BODY_AIM / flows.CROWDING_AIM, 1.2
+    scale, radius = flow_errors.BODY_AIM / flow_errors.CROWDING_AIM, 1.2
     error = crowding_error(paired, true, radius)
     # Each has one neighbour at distance 0; nobody had any nearer than 1, and 6 of those at most.
     least = 1 - 6 * (1 - 1 / radius) ** 2
