@@ -255,7 +255,7 @@ def test_a_step_down_the_gradient_makes_flows_better(slides):
     assert last < 0.9 * first
 
 
-def test_agreement_is_where_all_get_better(monkeypatch):
+def test_agreement_helps_the_flow_that_the_mean_makes_worse(monkeypatch):
     """Three say "farther" along one axis and one the contrary; each has a little of its own."""
     rng = np.random.default_rng(0)
     gradients = torch.zeros(4, 50, dtype=torch.float64)
