@@ -147,7 +147,7 @@ def recipe_of(
         flow_edges=FLOW_EDGES,
         statistics_windows=32,  # the model keeps those it was trained with
         device="cpu" if lesson.start.device == "cpu" else "cuda",
-        precision="bfloat16",
+        precision="auto",
         checkpoint_minutes=1.0,
     )
 

@@ -7,7 +7,7 @@ import time
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from torch import Tensor
 from gns_model.errors import SimulatorError
 from gns_model.learned import scope
 from gns_model.learned.model import LearnedModel
+from gns_model.learned.precision import Precision, is_short
 from gns_model.learned.predict import Array, Bounds, predict_positions
 from gns_model.learned.rollout import batch_points, groups, place, roll_out, roll_out_tensor
 from gns_model.learned.start import Start, frame_count, shifted, start
@@ -35,7 +36,8 @@ class LearnedSimulator:
         threads: torch threads on the CPU during a rollout; default: as torch is set.
         workers: processes that share the scenes of a rollout, on the CPU, one thread each.
         precision: "bfloat16" makes the products over edges in that dtype: a little faster on a
-            CPU, much on a GPU, at half a percent of error in each step's acceleration.
+            CPU that has instructions for it (several times slower on one that has none), much on a
+            GPU, at half a percent of error in each step's acceleration. "auto": where it is faster.
         filling: seed of the places in their cells that points start from; of no effect on a model
             without `subcells`.
     """
@@ -48,11 +50,11 @@ class LearnedSimulator:
         *,
         threads: int | None = None,
         workers: int = 1,
-        precision: str = "float32",
+        precision: Precision = "float32",
         filling: int = 0,
     ) -> None:
-        if precision not in ("float32", "bfloat16"):
-            raise SimulatorError(f"precision must be float32 or bfloat16, got {precision!r}")
+        if precision not in get_args(Precision):
+            raise SimulatorError(f"precision must be float32, bfloat16 or auto, got {precision!r}")
         for option, value in (("threads", threads), ("workers", workers)):
             if value is not None and value < 1:
                 raise SimulatorError(f"{option} must be at least 1, got {value}")
@@ -62,7 +64,7 @@ class LearnedSimulator:
         self.card = dict(card or {})
         self.threads = threads
         self.workers = workers
-        self.precision = precision
+        self.precision: Precision = "bfloat16" if is_short(precision, self.device) else "float32"
         self.filling = filling
         self._warned: set[str] = set()
         self._pool: Any = None

@@ -14,6 +14,7 @@ from gns_model.data.windows import WindowIndex
 from gns_model.files import write_whole
 from gns_model.learned.checkpoint import save_model
 from gns_model.learned.model import LearnedModel
+from gns_model.learned.precision import is_short
 from gns_model.training import batches
 from gns_model.training.claim import TrainingError, claim, tidy
 from gns_model.training.distributed import RankError, Ranks, session
@@ -86,6 +87,7 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: Stop) ->
         raise
     model, average, optimiser, position = run.model, run.average, run.optimiser, run.position
     config = model.config
+    short = is_short(recipe.precision, ranks.device)
     if recipe.compile:
         model.network.compile(dynamic=True)
     judged = LearnedModel(config).to(ranks.device)  # holds the moving average
@@ -145,7 +147,7 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: Stop) ->
                 f"{recipe.name}: {sum(sizes)} parameters, {len(data.sources)} trajectories"
                 + (f" ({len(data.skipped)} that ended badly left out)" if data.skipped else "")
                 + (f", {len(held_out.sources)} held out" if held_out else "")
-                + f", {ranks.world} rank(s)"
+                + f", {ranks.world} rank(s), {'bfloat16' if short else 'float32'}"
                 + (f", resumed at step {position.step}" if position.step else "")
             )
         on_gpu = ranks.device.type == "cuda"
@@ -159,7 +161,7 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: Stop) ->
                 progress = done / budget
                 with stop.may_abandon():
                     loss, edges = _forward_and_backward(
-                        run, recipe, data, feeder, replay, ranks, progress
+                        run, recipe, data, feeder, replay, ranks, progress, short
                     )
                 rate = learning_rate(recipe, position.step, progress)
 
@@ -243,15 +245,19 @@ def _forward_and_backward(
     replay: Replay,
     ranks: Ranks,
     progress: float,
+    short: bool,
 ) -> tuple[Tensor, float]:
     """Loss of this rank's share of the next step, with its gradients in the parameters.
+
+    Args:
+        progress: share of the budget that is spent.
+        short: multiply in bfloat16.
 
     Returns:
         the loss, a scalar, and the number of edges.
     """
     step, model = run.position.step, run.model
-    autocast = recipe.precision == "bfloat16"
-    context = torch.autocast(ranks.device.type, torch.bfloat16) if autocast else nullcontext()
+    context = torch.autocast(ranks.device.type, torch.bfloat16) if short else nullcontext()
     unrolled = progress >= 1 - recipe.unroll_fraction
     kinematic = kinematic_spacing(recipe.model)
     rng = batches.generator(recipe.seed, batches.REPLAY, step)  # the same on all ranks

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from gns_model.errors import GnsError, first_fault
 from gns_model.files import write_whole
 from gns_model.learned.config import ModelConfig
+from gns_model.learned.precision import Precision
 from gns_model.particles import MOVING
 from gns_model.toml import read_toml, toml_text
 
@@ -66,6 +67,7 @@ class Recipe(BaseModel):
     linear_beyond: Positive | None = None
     #: Weight of the error that all points of a scene share; see `loss.Emphasis`.
     momentum_weight: NonNegative = 0.0
+    local_weight: NonNegative = 0.0  #: likewise of the mean error of a cell of some grains
     front_weight: NonNegative = 0.0  #: likewise of the front of a scene
     #: Errors count relative to what accelerates their scene, this much more [standard deviations].
     relative_to: Positive | None = None
@@ -100,7 +102,7 @@ class Recipe(BaseModel):
     backprop_through_unroll: bool = False
 
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    precision: Literal["float32", "bfloat16"] = "float32"  #: of matrix products
+    precision: Precision = "float32"  #: of matrix products; "auto": bfloat16 where that is faster
     compile: bool = False  #: the network by torch.compile; on a CPU it needs g++ and a minute
     threads: Count = 1  #: of every CPU rank
     seed: Annotated[int, Field(ge=0)] = 0
