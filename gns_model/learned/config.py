@@ -154,6 +154,11 @@ class ModelConfig(BaseModel):
     #: Give vertices the overburden, the flow depth and its slope, of the mass within this distance
     #: along the base [m]; 0: leave them out, as the paper does. See `features.depth_features`.
     depth_range: NonNegative = 0.0
+    #: Give vertices the direction of the strain rate and of the velocity beside their size, and
+    #: edges that of the relative velocity: friction knows only directions. Rates below this fade
+    #: [1/s]; 0: leave them out, as the paper does. Needs `relative_velocity`. See
+    #: `features.strain_features`.
+    strain_unit: NonNegative = 0.0
     #: Push points out of the boxes and into the domain after every step.
     project: bool = True
 
@@ -179,6 +184,8 @@ class ModelConfig(BaseModel):
             raise ValueError('baffles = "points" needs types > 0 to tell them from moving points')
         if self.solver_steps and self.subcells > 1:
             raise ValueError("solver_steps needs the solver's own points: subcells = 1")
+        if self.strain_unit and not self.relative_velocity:
+            raise ValueError("strain_unit needs relative_velocity = true")
         if self.radius <= self.spacing:
             raise ValueError(
                 f"radius {self.radius:g} m must exceed the spacing {self.spacing:g} m, "
@@ -200,12 +207,14 @@ class ModelConfig(BaseModel):
         """Width of the vertex features, without the type embedding."""
         width = self.history * self.dim + 2 * self.dim + len(self.material_features)
         width += self.dim + 1 if self.depth_range else 0
+        width += self.dim * (self.dim + 1) // 2 + 1 + self.dim if self.strain_unit else 0
         return width + (self.dim + 2 if self.baffles == "distance" else 0)
 
     @property
     def edge_inputs(self) -> int:
         """Width of the edge features."""
-        return self.dim + 1 + (self.dim if self.relative_velocity else 0)
+        relative = int(self.relative_velocity) + int(self.strain_unit > 0)
+        return self.dim + 1 + relative * self.dim
 
     @classmethod
     def paper(cls, dim: Literal[2, 3] = 2) -> ModelConfig:

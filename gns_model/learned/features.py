@@ -163,12 +163,63 @@ def depth_features(
     return summed.index_add(0, receivers, parts)
 
 
+def strain_features(
+    positions: Tensor,
+    velocity: Tensor,
+    senders: Tensor,
+    receivers: Tensor,
+    radius: float,
+    unit: float,
+) -> Tensor:
+    """Direction and size of the strain rate and of the velocity, shape (N, D (D + 1) / 2 + D + 1).
+
+    The friction of grains does not depend on how fast they are sheared: the stress of a
+    Mohr-Coulomb material, or of mu(I) for small I, is that of its pressure times D / |D|, however
+    small the strain rate D, and the friction of the base that of v / |v|. In linear features the
+    slow half of a heap, which decides where it stops, is a hair's breadth of all inputs. Here,
+    with the velocity gradient by least squares over the neighbours, weighed by (1 - (r / R)²)²,
+
+        D / sqrt(D:D + unit²),   log(1 + D:D / unit²) / 2,   v / sqrt(v² + (unit R)²).
+
+    Args:
+        positions: [m], shape (N, D).
+        velocity: [m/s], shape (N, D).
+        senders, receivers: of all edges, shape (E,).
+        radius: R [m].
+        unit: rate below which a strain is none [1/s].
+    """
+    count, dim = positions.shape
+    apart = (positions[senders] - positions[receivers]) / radius
+    faster = velocity[senders] - velocity[receivers]
+    near = (1 - apart.square().sum(1, keepdim=True)).clamp_min(0).square() * apart
+    both = torch.cat([apart, faster / (unit * radius)], dim=1)
+    products = (both[:, :, None] * near[:, None, :]).flatten(1)
+    summed = positions.new_zeros((count, 2 * dim * dim)).index_add(0, receivers, products)
+    spread, shear = summed.view(count, 2, dim, dim).unbind(1)
+    # The small term holds where a grain has too few neighbours to tell; there D fades to zero.
+    few = 0.02 * torch.eye(dim, dtype=positions.dtype, device=positions.device)
+    gradient = torch.linalg.solve(spread + few, shear, left=False)
+    rate = (gradient + gradient.transpose(1, 2)) / 2
+    square = rate.square().sum((1, 2))[:, None]
+    rows, columns = torch.triu_indices(dim, dim, device=positions.device)
+    slip = velocity / (unit * radius)
+    return torch.cat(
+        [
+            rate[:, rows, columns] / (square + 1).sqrt(),
+            square.log1p() / 2,
+            slip / (slip.square().sum(1, keepdim=True) + 1).sqrt(),
+        ],
+        dim=1,
+    )
+
+
 def edge_features(
     positions: Tensor,
     velocity: Tensor | None,
     senders: Tensor,
     receivers: Tensor,
     radius: float,
+    least: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Displacement p_i - p_j and its norm over the radius, then v_i - v_j; i receives, j sends.
 
@@ -177,14 +228,19 @@ def edge_features(
         velocity: normalised, shape (N, D), or None to leave it out.
         senders, receivers: shape (E,).
         radius: [m].
+        least: add the direction of v_i - v_j, of which less than this (in the unit of `velocity`)
+            fades; None: leave it out.
 
     Returns:
-        features, shape (E, D + 1) or (E, 2D + 1), and norm / radius, shape (E, 1).
+        features, shape (E, D + 1), (E, 2D + 1) or (E, 3D + 1), and norm / radius, shape (E, 1).
     """
     displacement = (positions[receivers] - positions[senders]) / radius
     # The tiny term keeps the derivative finite for points that coincide.
     norm = (displacement.square().sum(1, keepdim=True) + 1e-12).sqrt()
     parts = [displacement, norm]
     if velocity is not None:
-        parts.append(velocity[receivers] - velocity[senders])
+        relative = velocity[receivers] - velocity[senders]
+        parts.append(relative)
+        if least is not None:
+            parts.append(relative / (relative.square().sum(1, keepdim=True) + least**2).sqrt())
     return torch.cat(parts, dim=1), norm

@@ -83,19 +83,30 @@ class LearnedModel(nn.Module):
         senders, receivers = radius_graph(
             positions, config.radius, world.batch, self_edges=config.self_edges
         )
+        # As fast as a strain of this rate moves neighbours past each other.
+        least = config.strain_unit * config.radius / self.velocity_std.square().mean().sqrt()
         edge, distance = features.edge_features(
             positions,
             normalised[:, -1] if config.relative_velocity else None,
             senders,
             receivers,
             config.radius,
+            least if config.strain_unit else None,
         )
         weight = features.envelope(distance) if config.envelope else None
-        vertex = self._vertex_features(positions, velocities[:, -1], normalised, world)
+        vertex = self._vertex_features(
+            positions, velocities[:, -1], normalised, world, senders, receivers
+        )
         return self.network(vertex, edge, senders, receivers, weight)
 
     def _vertex_features(
-        self, positions: Tensor, velocity: Tensor, normalised: Tensor, world: World
+        self,
+        positions: Tensor,
+        velocity: Tensor,
+        normalised: Tensor,
+        world: World,
+        senders: Tensor,
+        receivers: Tensor,
     ) -> Tensor:
         config = self.config
         parts = [
@@ -123,6 +134,12 @@ class LearnedModel(nn.Module):
             parts.append(
                 features.depth_features(
                     positions, world.moving, world.batch, config.depth_range, config.spacing
+                )
+            )
+        if config.strain_unit:
+            parts.append(
+                features.strain_features(
+                    positions, velocity, senders, receivers, config.radius, config.strain_unit
                 )
             )
         if config.material_features:

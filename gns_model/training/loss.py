@@ -17,6 +17,8 @@ from gns_model.training.recipe import Recipe
 
 #: Share of a scene's moving points that are its front: those farthest along x.
 FRONT = 0.05
+#: Side of the cells of the local error [spacings]: a dozen grains in 2D.
+CELL = 4.0
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,9 @@ class Emphasis:
         momentum_weight: of the mean over scenes of the square (or pseudo-Huber) of a scene's mean
             error. An error that all points share moves the centroid, or lets a heap sink into
             itself, and hardly shows in the mean of squares.
+        local_weight: of the mean square (or pseudo-Huber) of the mean error in cells of `CELL`
+            spacings. What single grains do is noise for the most part; a cell's mean is what the
+            flow does there, and its error is one that the step repeats.
         front_weight: likewise of the mean error of a scene's front (`FRONT`), a twentieth of the
             points that decides the runout, and a twentieth of the mean of squares.
         scenes_alike: every scene of the batch counts as much as any other, not as many times as it
@@ -42,6 +47,7 @@ class Emphasis:
 
     linear_beyond: float | None = None
     momentum_weight: float = 0.0
+    local_weight: float = 0.0
     front_weight: float = 0.0
     scenes_alike: bool = False
     relative_to: float | None = None
@@ -80,7 +86,7 @@ def step_error(
         batch: scene of every point, shape (N,); default: all in one.
         moving: mask of the points that count, shape (N,); default: all.
     """
-    place, error = history[:, -1, 0], (after - history[:, -1]) - move
+    place, error = history[:, -1], (after - history[:, -1]) - move
     asked = move - (history[:, -1] - history[:, -2])
     if moving is not None:
         place, error, asked = place[moving], error[moving], asked[moving]
@@ -92,13 +98,20 @@ def step_error(
     if emphasis.relative_to is not None:
         strong = _scene_mean((asked / unit).square(), batch).mean(1, keepdim=True)
         error = error / (strong + emphasis.relative_to**2).sqrt()[batch]
-    loss = _penalty(error, linear_beyond)
-    loss = _scene_mean(loss, batch).mean() if emphasis.scenes_alike else loss.mean()
+
+    def over_points(squares: Tensor) -> Tensor:
+        return _scene_mean(squares, batch).mean() if emphasis.scenes_alike else squares.mean()
+
+    loss = over_points(_penalty(error, linear_beyond))
+    if emphasis.local_weight:
+        cell = _cells(place.detach(), batch, CELL * model.config.spacing)
+        mean = _scene_mean(error, cell)[cell]
+        loss = loss + emphasis.local_weight * over_points(_penalty(mean, linear_beyond))
     if emphasis.momentum_weight:
         mean = _scene_mean(error, batch)
         loss = loss + emphasis.momentum_weight * _penalty(mean, linear_beyond).mean()
     if emphasis.front_weight:
-        ahead = _front(place.detach(), batch)
+        ahead = _front(place[:, 0].detach(), batch)
         mean = _scene_mean(error[ahead], batch[ahead])
         loss = loss + emphasis.front_weight * _penalty(mean, linear_beyond).mean()
     return loss
@@ -114,9 +127,16 @@ def _penalty(error: Tensor, linear_beyond: float | None) -> Tensor:
 
 
 def _scene_mean(values: Tensor, batch: Tensor) -> Tensor:
-    """Mean of `values` (N, D) over the points of every scene, shape (S, D)."""
+    """Mean of `values` (N, D) over the points of every scene (or cell), shape (S, D)."""
     counts = torch.bincount(batch).to(values.dtype)[:, None]
     return values.new_zeros((len(counts), values.shape[1])).index_add(0, batch, values) / counts
+
+
+def _cells(place: Tensor, batch: Tensor, size: float) -> Tensor:
+    """The cell of `size` [m] and scene that every point lies in, numbered from 0, shape (N,)."""
+    corner = torch.cat([batch[:, None], (place / size).floor().long()], dim=1)
+    cells: Tensor = corner.unique(dim=0, return_inverse=True)[1]
+    return cells
 
 
 def _front(place: Tensor, batch: Tensor) -> Tensor:

@@ -14,20 +14,21 @@ from gns_model.learned.model import LearnedModel
 from gns_model.training.recipe import RecipeError
 
 #: What may differ between the two configurations: the weights do not depend on it, or, for the
-#: last two, `inherit` makes room.
+#: last three, `inherit` makes room.
 FREE = {
     "noise_std", "subcells", "limits", "bounds", "solver_steps", "material_features", "depth_range",
+    "strain_unit",
 }  # fmt: skip
 
-_FIRST = "network.encode_vertex.layers.0.weight"
+_FIRST = "network.encode_{}.layers.0.weight"
 
 
 @torch.no_grad()
 def inherit(model: LearnedModel, start_from: str) -> None:
     """Copy weights and normalisation of the model `start_from` into `model`, in place.
 
-    Material and depth features that only `model` has get weights of zero: it begins by ignoring
-    them, and moves points exactly as its parent does.
+    Material, depth and strain features that only `model` has get weights of zero: it begins by
+    ignoring them, and moves points exactly as its parent does.
 
     Args:
         start_from: a shipped model or a checkpoint folder.
@@ -46,26 +47,35 @@ def inherit(model: LearnedModel, start_from: str) -> None:
     mine, theirs = model.config, parent.config
     _check(mine, theirs, start_from)
     state = parent.state_dict()
-    own, known = _inputs(mine), _inputs(theirs)
-    if own != known:
-        weight = state[_FIRST]
-        columns = dict(zip(known, weight.unbind(1), strict=True))
-        state[_FIRST] = torch.stack(
-            [columns.get(name, torch.zeros_like(weight[:, 0])) for name in own], dim=1
-        )
+    for what, inputs in (("vertex", _vertex_inputs), ("edge", _edge_inputs)):
+        own, known = inputs(mine), inputs(theirs)
+        if own != known:
+            weight = state[_FIRST.format(what)]
+            columns = dict(zip(known, weight.unbind(1), strict=True))
+            state[_FIRST.format(what)] = torch.stack(
+                [columns.get(name, torch.zeros_like(weight[:, 0])) for name in own], dim=1
+            )
     model.load_state_dict(state)
 
 
-def _inputs(config: ModelConfig) -> list[str]:
+def _vertex_inputs(config: ModelConfig) -> list[str]:
     """A name for every input of the vertex encoder, in its order."""
-    depth = [f"depth {k}" for k in range(config.dim + 1)] if config.depth_range else []
+    dim = config.dim
+    depth = [f"depth {k}" for k in range(dim + 1)] if config.depth_range else []
+    rates = dim * (dim + 1) // 2 + 1 + dim if config.strain_unit else 0
     material = list(config.material_features)
     embedded = config.type_embedding if config.types else 0
-    surroundings = range(config.vertex_inputs - len(depth) - len(material))
+    surroundings = range(config.vertex_inputs - len(depth) - rates - len(material))
     return [
-        *(f"surroundings {k}" for k in surroundings), *depth, *material,
+        *(f"surroundings {k}" for k in surroundings), *depth,
+        *(f"strain {k}" for k in range(rates)), *material,
         *(f"type {k}" for k in range(embedded)),
     ]  # fmt: skip
+
+
+def _edge_inputs(config: ModelConfig) -> list[str]:
+    """A name for every input of the edge encoder, in its order."""
+    return [f"edge {k}" for k in range(config.edge_inputs)]
 
 
 def _check(mine: ModelConfig, theirs: ModelConfig, name: str) -> None:
@@ -80,6 +90,11 @@ def _check(mine: ModelConfig, theirs: ModelConfig, name: str) -> None:
         raise RecipeError(
             f"start_from = {name!r}: its depth_range is {theirs.depth_range:g}, the recipe's "
             f"{mine.depth_range:g}"
+        )
+    if theirs.strain_unit and mine.strain_unit != theirs.strain_unit:
+        raise RecipeError(
+            f"start_from = {name!r}: its strain_unit is {theirs.strain_unit:g}, the recipe's "
+            f"{mine.strain_unit:g}"
         )
     dropped = set(theirs.material_features) - set(mine.material_features)
     if dropped:

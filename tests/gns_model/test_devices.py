@@ -29,6 +29,7 @@ MODELS = {
     "as baffle-lite": {},
     "the paper's": {"baffles": "points", "types": 9, "walls": "clip", "envelope": False},
     "depth and material": {"depth_range": 0.1, "material_features": ("tan_friction_angle",)},
+    "strain": {"strain_unit": 0.3},
     "solver first": {"solver_steps": 2},
 }
 

@@ -14,8 +14,10 @@ from gns_model.learned.features import (
     envelope,
     fade,
     signed_distance,
+    strain_features,
     wall_features,
 )
+from gns_model.learned.graph import radius_graph
 
 BOX = torch.tensor([[[[0.2, 0.0, 0.2], [0.5, 0.4, 0.6]]]], dtype=torch.float64)
 coordinate = st.floats(-0.3, 1.0)
@@ -150,3 +152,51 @@ def test_gradient_of_depth_features(dim):
     shift = torch.rand((12, dim), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     points = (shift * 0.1).requires_grad_()
     assert torch.autograd.gradcheck(lambda p: depths(p), points, eps=1e-7, atol=1e-5)
+
+
+def strains(points, velocity, unit=0.5, radius=0.05):
+    return strain_features(points, velocity, *radius_graph(points.detach(), radius), radius, unit)
+
+
+def in_shear(dim, rate):
+    """Points of a block with a linear velocity field, those of its inside, and the gradient."""
+    points = heap(dim).double()
+    gradient = rate * torch.tensor([[0.3, 1.0, 0.2], [-0.2, -0.3, 0.0], [0.5, 0.1, 0.4]])
+    gradient = gradient[:dim, :dim].double()
+    inner = (points > 0.05).all(1) & (points < points.amax(0) - 0.05).all(1)
+    return points, points @ gradient.T, inner, gradient
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_strain_features_of_a_linear_field(dim):
+    points, velocity, inner, gradient = in_shear(dim, 4.0)
+    direction, size, slip = strains(points, velocity).split([dim * (dim + 1) // 2, 1, dim], dim=1)
+    rate = (gradient + gradient.T) / 2 / 0.5
+    square = rate.square().sum()
+    wanted = (rate / (square + 1).sqrt())[tuple(torch.triu_indices(dim, dim))]
+    assert (direction[inner] - wanted).abs().max() < 0.01
+    assert (size[inner] - torch.log1p(square) / 2).abs().max() < 0.05
+    assert (slip.norm(dim=1) < 1).all()
+    # A translation of all strains nothing.
+    other = strains(points, velocity + 3.0)[:, : dim * (dim + 1) // 2]
+    torch.testing.assert_close(other, direction)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_friction_is_told_the_direction_however_slow_the_shear(dim):
+    slow, fast = (strains(*in_shear(dim, rate)[:2]) for rate in (5.0, 50.0))
+    inner, columns = in_shear(dim, 1.0)[2], dim * (dim + 1) // 2
+    assert (slow - fast)[inner, :columns].abs().max() < 0.02
+    assert ((fast - slow)[inner, columns] - np.log(10)).abs().max() < 0.05
+    still = strains(heap(dim).double(), torch.zeros_like(heap(dim)).double())
+    assert (still == 0).all()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_gradient_of_strain_features(dim):
+    """Also of a grain with one neighbour and of one with none."""
+    numbers = torch.rand((2, 8, dim), generator=torch.Generator().manual_seed(0)).double()
+    points = torch.cat([numbers[0] * 0.04, torch.tensor([[0.2] * dim, [0.22] * dim, [0.6] * dim])])
+    velocity = torch.cat([numbers[1], torch.tensor([[0.5] * dim] * 3)]) - 0.4
+    inputs = points.requires_grad_(), velocity.requires_grad_()
+    assert torch.autograd.gradcheck(strains, inputs, eps=1e-7, atol=1e-4)

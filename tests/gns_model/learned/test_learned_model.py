@@ -4,11 +4,13 @@ import pytest
 import torch
 
 from gns_model.learned import World
+from gns_model.learned.graph import radius_graph
 from gns_model.learned.world import baffle_boxes, baffle_points
 from gns_model.particles import MOVING, STATIONARY, fill
 
 DIMS = pytest.mark.parametrize("dim", [2, 3])
-DEPTH = pytest.mark.parametrize("depth_range", [0.0, 0.1])
+#: What vertices and edges may see beside the paper's features.
+MORE = pytest.mark.parametrize("more", [{}, {"depth_range": 0.1, "strain_unit": 0.3}])
 
 
 def start(model, scene, dtype=torch.float32, seed=0):
@@ -25,9 +27,9 @@ def start(model, scene, dtype=torch.float32, seed=0):
 
 
 @DIMS
-@DEPTH
-def test_permutation(make_model, make_scene, dim, depth_range):
-    model, scene = make_model(dim=dim, depth_range=depth_range), make_scene(dim)
+@MORE
+def test_permutation(make_model, make_scene, dim, more):
+    model, scene = make_model(dim=dim, **more), make_scene(dim)
     history, world = start(model, scene)
     order = torch.randperm(len(history), generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
@@ -37,9 +39,9 @@ def test_permutation(make_model, make_scene, dim, depth_range):
 
 
 @DIMS
-@DEPTH
-def test_translation_with_the_domain(make_model, make_scene, dim, depth_range):
-    model = make_model(dim=dim, depth_range=depth_range)
+@MORE
+def test_translation_with_the_domain(make_model, make_scene, dim, more):
+    model = make_model(dim=dim, **more)
     history, world = start(model, make_scene(dim))
     shift = (0.25, -0.5, 0.125)
     moved = make_scene(dim, shift)
@@ -53,7 +55,7 @@ def test_translation_with_the_domain(make_model, make_scene, dim, depth_range):
 def test_mirror_symmetric_features_do_not_favour_a_side(make_model, make_scene):
     # Weights know left from right; what they are fed must not: a step of the mirrored scene by
     # the network with mirrored inputs is the mirrored step.
-    model = make_model(depth_range=0.1)
+    model = make_model(depth_range=0.1, strain_unit=0.3)
     scene = make_scene()
     history, world = start(model, scene)
     z = make_scene().domain.upper[2]
@@ -65,7 +67,8 @@ def test_mirror_symmetric_features_do_not_favour_a_side(make_model, make_scene):
     seen = []
     for h, w in ((history, world), (mirrored, other)):
         velocities = (h[:, 1:] - h[:, :-1]) / model.config.dt
-        seen.append(model._vertex_features(h[:, -1], velocities[:, -1], velocities, w))
+        edges = radius_graph(h[:, -1], model.config.radius, w.batch)
+        seen.append(model._vertex_features(h[:, -1], velocities[:, -1], velocities, w, *edges))
     a, b = seen
     config = model.config
     sign, order = torch.ones(a.shape[1]), torch.arange(a.shape[1])
@@ -74,6 +77,8 @@ def test_mirror_symmetric_features_do_not_favour_a_side(make_model, make_scene):
     order[[walls + 2, walls + 5]] = order[[walls + 5, walls + 2]]  # the two side walls
     sign[walls + 6 + 3] = -1  # z of the baffles' normals
     sign[walls + 6 + 5 + 3] = -1  # slope of the flow depth along z
+    sign[[walls + 15 + 2, walls + 15 + 4]] = -1  # xz and yz of the strain rate
+    sign[walls + 15 + 9] = -1  # z of the direction of motion
     torch.testing.assert_close(b, (a * sign)[:, order], atol=1e-4, rtol=1e-4)
 
 

@@ -18,7 +18,7 @@ from gns_model.training.augment import mirror_positions, mirrored
 from gns_model.training.batches import DRAW, collate, draw, generator, read
 from gns_model.training.distributed import Ranks
 from gns_model.training.feeding import Feeder
-from gns_model.training.loss import FRONT, Emphasis, step_error, unrolled_loss
+from gns_model.training.loss import CELL, FRONT, Emphasis, step_error, unrolled_loss
 from gns_model.training.statistics import measure
 
 SPACING, DT, RADIUS = 0.0625, 0.02, 0.1
@@ -293,6 +293,29 @@ def test_an_error_that_a_scene_shares_weighs_more(free_flight):
     even = torch.where(order == 0, 1.0, -1.0)
     even[2 * (count // 4) * 2 :] = 0.0
     assert cost(even, 1000.0) < 1.2
+
+
+def test_an_error_that_neighbours_share_weighs_more(free_flight):
+    """Grains are laid out in cells of ten: one error all over a cell, or one that changes sign from
+    grain to grain within it."""
+    net, batch = ballistic(free_flight)
+    count = len(batch.history) // 10 * 10
+    history, move = batch.history[:count].clone(), batch.moves[:count, 0]
+    cell, number = torch.arange(count) // 10, torch.arange(count) % 10
+    side = CELL * net.config.spacing
+    place = torch.stack([cell + 0.05 + 0.09 * number, torch.full((count,), 0.5)], dim=1)
+    place = torch.cat([place, place[:, 1:]], dim=1) if history.shape[2] == 3 else place
+    history += (place * side)[:, None] - history[:, -1:]
+    scale = DT**2 * net.acceleration_std
+
+    def cost(error, weight):
+        after = history[:, -1] + move + error[:, None] * scale
+        return float(step_error(net, history, after, move, Emphasis(local_weight=weight)))
+
+    by_cell = torch.where(cell % 2 == 0, 1.0, -1.0)
+    by_grain = torch.where(number % 2 == 0, 1.0, -1.0)
+    assert cost(by_cell, 3.0) == pytest.approx(1 + 3, rel=1e-2)
+    assert cost(by_grain, 3.0) == pytest.approx(1, rel=1e-2)
 
 
 def test_an_error_of_the_front_weighs_more(free_flight):

@@ -33,10 +33,11 @@ def parent(tmp_path):
 
 
 def batch(slides):
+    """With noise, or there would be no strain for a model to see."""
     windows = WindowIndex([slides], spacing=0.0625, dt=0.02, history=3)
     return collate(
         [windows.read(k, 4, mixture=k) for k in (0, 1)],
-        noise_std=0.0,
+        noise_std=1e-3,
         rng=np.random.default_rng(0),
         device=torch.device("cpu"),
     )
@@ -57,6 +58,8 @@ def test_weights_and_normalisation_are_copied(parent):
         ({"material_features": ("base_friction", "tan_friction_angle")}, 2),
         ({"depth_range": 0.1}, 4),
         ({"depth_range": 0.1, "material_features": ("base_friction",)}, 5),
+        ({"strain_unit": 0.3}, 10),
+        ({"depth_range": 0.1, "strain_unit": 0.3, "material_features": ("base_friction",)}, 15),
     ],
 )
 def test_new_features_change_nothing_at_first(tmp_path, slides, types, more, new):
@@ -115,6 +118,9 @@ def test_other_parents_are_refused(parent, tmp_path):
     deep = save_model(tmp_path / "deep", build(depth_range=0.1))
     with pytest.raises(RecipeError, match=r"its depth_range is 0\.1, the recipe's 0"):
         inherit(build(), str(deep))
+    strained = save_model(tmp_path / "strained", build(strain_unit=0.3))
+    with pytest.raises(RecipeError, match=r"its strain_unit is 0\.3, the recipe's 0\.5"):
+        inherit(build(strain_unit=0.5), str(strained))
 
 
 def test_training_starts_from_the_parent(tiny, tmp_path):
