@@ -53,7 +53,7 @@ parser.add_argument("--batch", type=int, default=4, help="layouts proposed at a 
 parser.add_argument(
     "--duration", type=float, default=0.5, help="of the flows [s], which rest near 0.6 s"
 )
-parser.add_argument("--precision", default="bfloat16", help="of the products over edges")
+parser.add_argument("--precision", default="auto", help="float32, bfloat16 or auto")
 parser.add_argument("--simulator", default="baffle-lite", help="a shipped model or a path")
 parser.add_argument("--jobs", type=int, default=1, help="one-thread processes")
 parser.add_argument("--csv", type=Path, help="where to put all runs together; default: in --out")

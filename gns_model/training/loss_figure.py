@@ -28,7 +28,7 @@ LABELS = {
 }
 
 #: Columns of the validation log that are no relative errors.
-OTHER = ("step", "seconds", "score", "one_step", "slope", "diverged")
+OTHER = ("step", "seconds", "score", "one_step", "drive", "slope", "diverged")
 
 
 def plot(out: Path) -> None:

@@ -133,6 +133,28 @@ def test_columns_are_scored_without_depth_and_section(columns):
     assert np.isfinite(result.slope)
 
 
+def test_the_drive_is_how_much_of_the_acceleration_a_model_gives(columns):
+    """A model that gives all points the same push; the flows are pushed by different ones."""
+    index = WindowIndex([columns], spacing=SPACING, dt=DT, history=2)
+    model = plane_model()
+    for parameter in model.network.decode.parameters():
+        torch.nn.init.zeros_(parameter)
+    drives = []
+    for push in (0.0, 2.0, 4.0):
+        model.acceleration_mean[0] = push
+        alone = Ranks(0, 1, torch.device("cpu"))
+        drives.append(Validator(index, alone, 1, 24)(model, lambda: False).drive)
+    # What they are asked for: windows are drawn as the validator draws them.
+    rng, asked = np.random.default_rng(0), []
+    for _ in range(24):
+        source = int(rng.integers(len(index.sources)))
+        window = index.read(source, int(rng.random() * index.starts(source, 1)), mixture=0)
+        path = np.concatenate([window.history[:, -2:], window.future], axis=1)[..., 0]
+        asked.append(float(np.diff(path, 2, axis=1).mean()) / DT**2)
+    wanted = np.sum(asked) / np.sum(np.square(asked))
+    assert drives == pytest.approx([0.0, 2 * wanted, 4 * wanted], rel=0.02, abs=1e-4)
+
+
 def test_what_the_ranks_find_adds_up_to_what_one_finds(columns):
     """Two ranks in turn, each adding to a table that the other left: the same scores."""
 
