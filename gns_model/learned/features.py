@@ -198,7 +198,8 @@ def strain_features(
     spread, shear = summed.view(count, 2, dim, dim).unbind(1)
     # The small term holds where a grain has too few neighbours to tell; there D fades to zero.
     few = 0.02 * torch.eye(dim, dtype=positions.dtype, device=positions.device)
-    gradient = torch.linalg.solve(spread + few, shear, left=False)
+    # solve_ex: what has diverged shall end as a status, not in an exception of a library.
+    gradient = torch.linalg.solve_ex(spread + few, shear, left=False).result
     rate = (gradient + gradient.transpose(1, 2)) / 2
     square = rate.square().sum((1, 2))[:, None]
     rows, columns = torch.triu_indices(dim, dim, device=positions.device)

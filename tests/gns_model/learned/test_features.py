@@ -200,3 +200,15 @@ def test_gradient_of_strain_features(dim):
     velocity = torch.cat([numbers[1], torch.tensor([[0.5] * dim] * 3)]) - 0.4
     inputs = points.requires_grad_(), velocity.requires_grad_()
     assert torch.autograd.gradcheck(strains, inputs, eps=1e-7, atol=1e-4)
+
+
+def test_strain_features_of_what_is_not_finite_are_no_exception():
+    points = heap(2).double()
+    velocity = torch.zeros_like(points)
+    velocity[3] = torch.nan
+    seen = strains(points, velocity)
+    assert seen[3].isnan().any()
+    assert seen[-1].isfinite().all()
+    everywhere = torch.full_like(points[:4], torch.nan)
+    edges = torch.tensor([0, 1, 2, 3]), torch.tensor([1, 0, 3, 2])
+    assert strain_features(everywhere, everywhere, *edges, 0.05, 0.5).isnan().all()
