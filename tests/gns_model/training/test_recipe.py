@@ -36,6 +36,9 @@ def test_there_are_recipes():
         ({"schedule": "linear"}, "schedule"),
         ({"model": {"baffles": "points", "types": 5}}, "model.types must be 0 or at least 7"),
         ({"model": {"radius": 0.01}}, "radius"),
+        ({"model": {"strain_unit": 0.3, "relative_velocity": False}}, "needs relative_velocity"),
+        ({"local_weight": -1.0}, "local_weight"),
+        ({"precision": "half"}, "precision = 'half'"),
         ({"model": {"colour": "red"}}, "model.colour"),
     ],
 )
