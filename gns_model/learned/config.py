@@ -203,11 +203,16 @@ class ModelConfig(BaseModel):
         return self.hidden or self.latent
 
     @property
+    def strain_inputs(self) -> int:
+        """Width of `features.strain_features`, if vertices are given them."""
+        return self.dim * (self.dim + 1) // 2 + 1 + self.dim if self.strain_unit else 0
+
+    @property
     def vertex_inputs(self) -> int:
         """Width of the vertex features, without the type embedding."""
         width = self.history * self.dim + 2 * self.dim + len(self.material_features)
         width += self.dim + 1 if self.depth_range else 0
-        width += self.dim * (self.dim + 1) // 2 + 1 + self.dim if self.strain_unit else 0
+        width += self.strain_inputs
         return width + (self.dim + 2 if self.baffles == "distance" else 0)
 
     @property

@@ -60,15 +60,13 @@ def inherit(model: LearnedModel, start_from: str) -> None:
 
 def _vertex_inputs(config: ModelConfig) -> list[str]:
     """A name for every input of the vertex encoder, in its order."""
-    dim = config.dim
-    depth = [f"depth {k}" for k in range(dim + 1)] if config.depth_range else []
-    rates = dim * (dim + 1) // 2 + 1 + dim if config.strain_unit else 0
+    depth = [f"depth {k}" for k in range(config.dim + 1)] if config.depth_range else []
+    strain = [f"strain {k}" for k in range(config.strain_inputs)]
     material = list(config.material_features)
     embedded = config.type_embedding if config.types else 0
-    surroundings = range(config.vertex_inputs - len(depth) - rates - len(material))
+    surroundings = range(config.vertex_inputs - len(depth) - len(strain) - len(material))
     return [
-        *(f"surroundings {k}" for k in surroundings), *depth,
-        *(f"strain {k}" for k in range(rates)), *material,
+        *(f"surroundings {k}" for k in surroundings), *depth, *strain, *material,
         *(f"type {k}" for k in range(embedded)),
     ]  # fmt: skip
 
