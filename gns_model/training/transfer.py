@@ -2,9 +2,16 @@
 
 The paper names it among its next steps; here it saves most of the hours: a model that knows how
 grains collapse at one friction angle needs few examples more to learn what the angle changes.
+
+The parent may be of another scale. Friction has no length and no time of its own, so that a flow of
+grains without cohesion whose lengths are λ times as large is the same flow in times √λ times as
+long (Froude similarity): a model whose lengths are all λ times its parent's moves its points as the
+parent does once the speeds that it is normalised by are √λ times the parent's.
 """
 
 from __future__ import annotations
+
+import math
 
 import torch
 
@@ -20,6 +27,12 @@ FREE = {
     "strain_unit",
 }  # fmt: skip
 
+#: What is as long as the scale. What strain and depth are measured in does not grow with it.
+LENGTHS = ("spacing", "radius", "wall_range", "baffle_range")
+#: By how much a stride may be longer or shorter than similarity asks for [-]. Accelerations hardly
+#: depend on the stride over which they are averaged, and a dataset has a stride of its own.
+STRIDE_TOLERANCE = 0.1
+
 _FIRST = "network.encode_{}.layers.0.weight"
 
 
@@ -28,7 +41,8 @@ def inherit(model: LearnedModel, start_from: str) -> None:
     """Copy weights and normalisation of the model `start_from` into `model`, in place.
 
     Material, depth and strain features that only `model` has get weights of zero: it begins by
-    ignoring them, and moves points exactly as its parent does.
+    ignoring them, and moves points exactly as its parent does, or, if its lengths are λ times the
+    parent's, as the parent does a flow of that scale.
 
     Args:
         start_from: a shipped model or a checkpoint folder.
@@ -45,8 +59,11 @@ def inherit(model: LearnedModel, start_from: str) -> None:
     if not isinstance(parent, LearnedModel):
         raise RecipeError(f"start_from = {start_from!r} is no learned model")
     mine, theirs = model.config, parent.config
-    _check(mine, theirs, start_from)
+    scale = _scale(mine, theirs, start_from)
+    _check(mine, theirs, start_from, similar=scale != 1)
     state = parent.state_dict()
+    for name in ("velocity_mean", "velocity_std"):
+        state[name] = state[name] * math.sqrt(scale)
     for what, inputs in (("vertex", _vertex_inputs), ("edge", _edge_inputs)):
         own, known = inputs(mine), inputs(theirs)
         if own != known:
@@ -56,6 +73,37 @@ def inherit(model: LearnedModel, start_from: str) -> None:
                 [columns.get(name, torch.zeros_like(weight[:, 0])) for name in own], dim=1
             )
     model.load_state_dict(state)
+
+
+def _scale(mine: ModelConfig, theirs: ModelConfig, name: str) -> float:
+    """λ, by which the lengths of `mine` exceed those of `theirs`.
+
+    Raises:
+        RecipeError: if they are not all in one proportion, the stride does not follow as √λ, or
+            the parent sees what does not scale.
+    """
+    scale = mine.spacing / theirs.spacing
+    if math.isclose(scale, 1.0):
+        return 1.0
+    for key in LENGTHS:
+        wanted, found = getattr(mine, key), getattr(theirs, key)
+        if not math.isclose(wanted, scale * found, rel_tol=1e-6):
+            raise RecipeError(
+                f"start_from = {name!r}: its spacing is {theirs.spacing:g}, the recipe's "
+                f"{mine.spacing:g}, so {key} must be {scale * found:g}, not {wanted:g}"
+            )
+    stride = math.sqrt(scale) * theirs.dt
+    if abs(mine.dt / stride - 1) > STRIDE_TOLERANCE:
+        raise RecipeError(
+            f"start_from = {name!r}: at {scale:g} times its scale dt must be within "
+            f"{STRIDE_TOLERANCE:.0%} of {stride:.4g}, not {mine.dt:g}"
+        )
+    if theirs.depth_range or theirs.strain_unit:
+        raise RecipeError(
+            f"start_from = {name!r}: it sees depths in metres or strain rates, so it can only "
+            "start models of its own spacing"
+        )
+    return scale
 
 
 def _vertex_inputs(config: ModelConfig) -> list[str]:
@@ -76,11 +124,12 @@ def _edge_inputs(config: ModelConfig) -> list[str]:
     return [f"edge {k}" for k in range(config.edge_inputs)]
 
 
-def _check(mine: ModelConfig, theirs: ModelConfig, name: str) -> None:
+def _check(mine: ModelConfig, theirs: ModelConfig, name: str, *, similar: bool) -> None:
     wanted = mine.model_dump(mode="json", exclude=FREE)
     found = theirs.model_dump(mode="json", exclude=FREE)
+    settled = {*LENGTHS, "dt"} if similar else set()  # by `_scale`
     for key, value in wanted.items():
-        if value != found[key]:
+        if value != found[key] and key not in settled:
             raise RecipeError(
                 f"start_from = {name!r}: its {key} is {found[key]!r}, the recipe's {value!r}"
             )

@@ -10,6 +10,7 @@ from gns_model.data.windows import WindowIndex
 from gns_model.learned.checkpoint import load_model, save_model
 from gns_model.learned.config import ModelConfig
 from gns_model.learned.model import LearnedModel
+from gns_model.scene import Scene
 from gns_model.training import Recipe, RecipeError, train
 from gns_model.training.batches import collate
 from gns_model.training.transfer import inherit
@@ -105,6 +106,71 @@ def test_another_architecture_is_refused_in_one_line(parent, changes, words):
     with pytest.raises(RecipeError, match=words) as caught:
         inherit(build(**changes), str(parent[0]))
     assert "\n" not in str(caught.value)
+
+
+def scene_of(scale: float) -> Scene:
+    """A block that slides into a baffle; its speed and duration follow the lengths as their root."""
+    return Scene.from_dict(
+        {
+            "name": "similar",
+            "duration": 0.2 * scale**0.5,
+            "domain": {"lower": (0.0,) * 3, "upper": (2.0 * scale, 1.0 * scale, 1.0 * scale)},
+            "release": [
+                {
+                    "lower": (0.25 * scale, 0.0, 0.25 * scale),
+                    "upper": (0.75 * scale, 0.25 * scale, 0.75 * scale),
+                    "velocity": (2.0 * scale**0.5, 0.0, 0.1 * scale**0.5),
+                }
+            ],
+            "baffle": [
+                {
+                    "center": (0.95 * scale, 0.5 * scale),
+                    "size": (0.25 * scale, 0.5 * scale, 0.25 * scale),
+                }
+            ],
+        }
+    )
+
+
+@pytest.mark.parametrize("scale", [0.5, 4.0])
+def test_a_parent_of_another_scale_moves_points_alike(tmp_path, scale):
+    """Froude similarity: lengths times scale, times and speeds times its root, the same flow."""
+    folder = save_model(tmp_path / "parent", build(wall_range=0.1, baffle_range=0.2))
+    child = build(
+        seed=1,
+        spacing=0.0625 * scale,
+        radius=0.1 * scale,
+        wall_range=0.1 * scale,
+        baffle_range=0.2 * scale,
+        dt=0.02 * scale**0.5,
+    )
+    inherit(child, str(folder))
+    small = load_model(folder).rollout([scene_of(1.0)])[0].positions
+    large = load_model(save_model(tmp_path / "child", child)).rollout([scene_of(scale)])[0]
+    assert np.abs(small[-1] - small[0]).max() > 0.05
+    np.testing.assert_allclose(large.positions / scale, small, atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"radius": 0.1}, "so radius must be 0.05, not 0.1"),
+        ({"radius": 0.05, "dt": 0.02}, r"dt must be within 10% of 0\.01414, not 0\.02"),
+    ],
+)
+def test_a_scale_that_is_not_one_scale_is_refused(parent, changes, words):
+    half = {"spacing": 0.03125, "wall_range": 0.025, "baffle_range": 0.05}
+    with pytest.raises(RecipeError, match=words):
+        inherit(build(**{**half, **changes}), str(parent[0]))
+    inherit(build(**{**half, "radius": 0.05, "dt": 0.015}), str(parent[0]))
+
+
+@pytest.mark.parametrize("seen", [{"depth_range": 0.1}, {"strain_unit": 0.3}])
+def test_what_is_seen_in_metres_or_seconds_does_not_scale(tmp_path, seen):
+    folder = save_model(tmp_path / "parent", build(**seen))
+    half = {"spacing": 0.03125, "radius": 0.05, "wall_range": 0.025, "baffle_range": 0.05}
+    with pytest.raises(RecipeError, match="only start models of its own spacing"):
+        inherit(build(**half, dt=0.014, **seen), str(folder))
 
 
 def test_other_parents_are_refused(parent, tmp_path):
