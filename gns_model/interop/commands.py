@@ -119,6 +119,12 @@ def export_dataset(
         float | None,
         typer.Option(min=1e-9, help="Connectivity radius for the metadata in m; default: paper's."),
     ] = None,
+    frames: Annotated[
+        int | None,
+        typer.Option(
+            min=3, help="Write the first so many frames of every trajectory; default: all."
+        ),
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Export trajectories as a dataset of geoelements/gns, with metadata.json beside it."""
@@ -130,6 +136,7 @@ def export_dataset(
             folder,
             out,
             radius=radius,
+            frames=frames,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     print(f"{out}, metadata.json beside it" + ("" if wrote else " kept as it was"))

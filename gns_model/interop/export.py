@@ -10,6 +10,7 @@ import pickle
 import tempfile
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ def export_dataset(
     out: str | os.PathLike[str],
     *,
     radius: float | None = None,
+    frames: int | None = None,
     progress: Progress | None = None,
 ) -> bool:
     """Write the trajectories of a folder into one npz, and `metadata.json` beside it.
@@ -46,13 +48,16 @@ def export_dataset(
         out: the npz to write.
         radius: connectivity radius for the metadata [m]; default: that of an imported dataset, or
             the paper's in proportion to the spacing.
+        frames: number of first frames to write of every trajectory; default: all, and then all
+            have to have as many, since `sequence_length` holds for the whole dataset.
         progress: called with the number of trajectories done and to do.
 
     Returns:
         whether it wrote the metadata file.
 
     Raises:
-        FileFormatError: if there are no trajectories, or they differ in dimension, frames or dt.
+        FileFormatError: if there are no trajectories, or they differ in dimension, frames or dt,
+            or one has fewer frames than `frames`.
     """
     folder, out = Path(folder), Path(out)
     paths = sorted(p for p in folder.glob("*.h5") if not p.name.startswith("."))
@@ -66,7 +71,7 @@ def export_dataset(
     try:
         with os.fdopen(handle, "wb") as file, zipfile.ZipFile(file, "w") as archive:
             for number, path in enumerate(paths):
-                trajectory = Trajectory.load(path)
+                trajectory = _first_frames(Trajectory.load(path), frames, path)
                 positions, kinds, friction = _parts(trajectory)
                 sums.add(trajectory, path)
                 key = str(trajectory.settings.get("key", path.stem))
@@ -91,8 +96,27 @@ def export_dataset(
         values = sums.metadata(radius, material).keys()
     if radius is not None:
         values["default_connectivity_radius"] = radius
+    if frames is not None:
+        values["sequence_length"] = frames
     write_whole(beside, (json.dumps(values, indent=2) + "\n").encode())
     return True
+
+
+def _first_frames(trajectory: Trajectory, frames: int | None, path: Path) -> Trajectory:
+    """The first `frames` of a trajectory; all of it without.
+
+    Raises:
+        FileFormatError: naming the file, if it has fewer.
+    """
+    if frames is None:
+        return trajectory
+    if len(trajectory.time) < frames:
+        raise FileFormatError(
+            f"{path}: {len(trajectory.time)} frames, fewer than the {frames} asked for"
+        )
+    return replace(
+        trajectory, positions=trajectory.positions[:frames], time=trajectory.time[:frames]
+    )
 
 
 def object_array(parts: list[Any]) -> bytes:
@@ -167,7 +191,7 @@ class _Sums:
             raise FileFormatError(
                 f"{path}: {frames} frames in {dim}D, {dt:g} s apart, but {self.first[0].name} has "
                 f"{self.first[1]} in {self.first[2]}D, {self.first[3]:g} s apart: one dataset "
-                "has one of each"
+                "has one of each (frames=N, or --frames N, writes the first N of every one)"
             )
         self.low, self.high = np.minimum(self.low, low), np.maximum(self.high, high)
         moving = trajectory.particle_type != STATIONARY

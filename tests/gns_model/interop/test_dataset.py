@@ -376,3 +376,21 @@ def test_trajectories_that_are_not_one_dataset(tmp_path):
     with pytest.raises(FileFormatError, match=r"b\.h5: 10 frames .* a\.h5 has 12"):
         export_dataset(tmp_path, tmp_path / "t.npz")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.h5", "b.h5"]
+
+
+def test_the_first_frames_of_flows_that_last_unequally_long_are_one_dataset(tmp_path):
+    (tmp_path / "ours").mkdir()
+    own(tmp_path / "ours", "a", flat())
+    own(tmp_path / "ours", "b", flat(), frames=10)
+    assert export_dataset(tmp_path / "ours", tmp_path / "train.npz", frames=10)
+    for each, name in zip(read_dataset(tmp_path / "train.npz"), "ab", strict=True):
+        moving = each.positions[:, each.particle_type != 3]
+        true = Trajectory.load(tmp_path / "ours" / f"{name}.h5").positions[:10]
+        np.testing.assert_array_equal(moving, true)
+    assert json.loads((tmp_path / "metadata.json").read_text())["sequence_length"] == 10
+    import_dataset(tmp_path / "train.npz", tmp_path / "metadata.json", tmp_path / "back")
+    export_dataset(tmp_path / "back", tmp_path / "again" / "train.npz", frames=8)
+    told = json.loads((tmp_path / "again" / "metadata.json").read_text())
+    assert told["sequence_length"] == 8
+    with pytest.raises(FileFormatError, match=r"b\.h5: 10 frames, fewer than the 11 asked for"):
+        export_dataset(tmp_path / "ours", tmp_path / "more.npz", frames=11)

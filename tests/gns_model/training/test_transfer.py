@@ -109,7 +109,7 @@ def test_another_architecture_is_refused_in_one_line(parent, changes, words):
 
 
 def scene_of(scale: float) -> Scene:
-    """A block that slides into a baffle; its speed and duration follow the lengths as their root."""
+    """A block that slides into a baffle; speed and duration grow as the root of the lengths."""
     return Scene.from_dict(
         {
             "name": "similar",
