@@ -57,12 +57,19 @@ def export_dataset(
 
     Raises:
         FileFormatError: if there are no trajectories, or they differ in dimension, frames or dt,
-            or one has fewer frames than `frames`.
+            or one has fewer frames than `frames`, or the metadata that is kept says another number.
     """
     folder, out = Path(folder), Path(out)
     paths = sorted(p for p in folder.glob("*.h5") if not p.name.startswith("."))
     if not paths:
         raise FileFormatError(f"{folder}: no trajectory files (*.h5) in this folder")
+    beside = out.parent / "metadata.json"
+    if frames is not None and beside.exists():
+        kept = read_json(beside).get("sequence_length")
+        if kept != frames:
+            raise FileFormatError(
+                f"{beside}: sequence_length = {kept}, but {frames} frames asked for"
+            )
     material = _with_material(paths)
     sums = _Sums()
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -87,7 +94,6 @@ def export_dataset(
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise
-    beside = out.parent / "metadata.json"
     if beside.exists():
         return False
     if (folder / "metadata.json").exists():

@@ -393,4 +393,7 @@ def test_the_first_frames_of_flows_that_last_unequally_long_are_one_dataset(tmp_
     told = json.loads((tmp_path / "again" / "metadata.json").read_text())
     assert told["sequence_length"] == 8
     with pytest.raises(FileFormatError, match=r"b\.h5: 10 frames, fewer than the 11 asked for"):
-        export_dataset(tmp_path / "ours", tmp_path / "more.npz", frames=11)
+        export_dataset(tmp_path / "ours", tmp_path / "new" / "more.npz", frames=11)
+    with pytest.raises(FileFormatError, match="sequence_length = 10, but 9 frames"):
+        export_dataset(tmp_path / "ours", tmp_path / "valid.npz", frames=9)
+    assert not (tmp_path / "valid.npz").exists()
