@@ -54,6 +54,7 @@ class Family(StrEnum):
     pressed_friction = "pressed-friction"
     bare = "bare"
     rows = "rows"
+    rectangles_friction = "rectangles-friction"
 
 
 @app.command()

@@ -212,7 +212,7 @@ class Comparison:
             ]  # fmt: skip
             table.add_row(name, cells[0], f"{AIMS[f'{name}.error'][1]:.1%}", *cells[1:])
         speedup = numbers["speedup"]
-        ratio = "" if speedup is None else f", {speedup:.0f} times the reference's speed"
+        ratio = "" if speedup is None else f", {speedup:.2g} times the reference's speed"
         slope, rank = AIMS["centroid_travel.slope"], AIMS["centroid_travel.spearman"]
         table.caption = (
             f"aims for the centroid: slope {slope[0]:g} to {slope[1]:g}, "

@@ -16,7 +16,7 @@ from gns_model.scene import Scene
 #: Boxes along each side of a square of the family "spreading"; a box is whole spacings wide.
 PARTS = 6
 
-#: Width of the box in which squares in motion stand [m].
+#: Width of a box with room for what runs far [m].
 WIDE = 2.0
 
 
@@ -35,6 +35,24 @@ def rectangle_scene(rng: np.random.Generator, index: int) -> Scene:
     height, aspect = rng.uniform(0.2, 0.4), np.exp(rng.uniform(np.log(0.6), np.log(3.5)))
     length = max(0.08, height / aspect)
     return _column_box((0.0, 0.0), (length, height), (0.0, 0.0), 30.0)
+
+
+def rectangle_friction_scene(rng: np.random.Generator, index: int) -> Scene:
+    """A scene of the family "rectangles-friction". Sides are whole multiples of two spacings of the
+    models, so that every filling of it is as large as the scene says."""
+    aspect = np.exp(rng.uniform(np.log(0.4), np.log(2.5)))
+    area = rng.uniform(0.03, 0.10)
+    sides = (math.sqrt(area / aspect), math.sqrt(area * aspect))
+    length, height = (round(0.025 * round(side / 0.025), 3) for side in sides)
+    # the runout of a low one of 15 degrees fits into the box
+    return _column_box(
+        (0.0, 0.0),
+        (length, height),
+        (0.0, 0.0),
+        FRICTION_ANGLES[index % len(FRICTION_ANGLES)],
+        WIDE,
+        duration=round(max(1.0, 5 * math.sqrt(height / 9.81)), 2),
+    )
 
 
 def square_scene(rng: np.random.Generator, index: int) -> Scene:

@@ -8,6 +8,9 @@ The paper's three datasets (table "Training data"), with what its columns and it
     barriers    3D: a cube of 0.2 to 0.4 m at a random place and velocity in a box of 0.8 m, with
                 one or two barriers of 0.1 x 0.3 x 0.1 m
     rectangles  2D: a rectangle at rest against a wall, of random aspect: the paper's validation
+    rectangles-friction
+                2D: a rectangle of 0.03 to 0.10 m2 and aspect 0.4 to 2.5 at rest against a wall, at
+                the five angles in turn
 
 and for what the paper's aspect ratios ask of a model that has seen aspect 1 only:
 
@@ -45,6 +48,7 @@ from gns_model.data.column_scenes import (
     friction_scene,
     pressed_friction_scene,
     pressed_scene,
+    rectangle_friction_scene,
     rectangle_scene,
     spreading_friction_scene,
     spreading_scene,
@@ -77,6 +81,7 @@ FAMILIES: dict[str, Callable[[np.random.Generator, int], Scene]] = {
     "pressed-friction": pressed_friction_scene,
     "bare": bare_scene,
     "rows": row_scene,
+    "rectangles-friction": rectangle_friction_scene,
 }
 
 

@@ -69,7 +69,10 @@ def evaluate(
     ] = 300.0,
     device: Annotated[Device, typer.Option(help="auto: the GPU, if there is one.")] = Device.auto,
     workers: Annotated[
-        int, typer.Option(min=1, help="Processes or threads.", show_default="all cores")
+        int,
+        typer.Option(
+            min=1, help="Processes, or threads of the one that there is.", show_default="all cores"
+        ),
     ] = CORES,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
@@ -104,10 +107,7 @@ def _by_suites(
     from gns_model.suites.setup import Setup
 
     found = _devices(device)
-    options: dict[str, Any] = {"workers": workers}
-    if model == "mpm":
-        options = {"threads": workers, "spacing": spacing}
-    simulator = load_simulator(model, device=found[-1], **options)
+    simulator = load_simulator(model, **simulator_options(model, found[-1], workers, spacing))
     left_out = chosen(suite.value, simulator)[1]  # refuses what does not fit before any work
     for name, reason in left_out.items():
         print(f"left out: {name}: {reason}", file=sys.stderr)
@@ -131,6 +131,19 @@ def _by_suites(
     for result in results:
         _show(result)
     print(f"tables and figures in {out}")
+
+
+def simulator_options(
+    model: str, device: str, workers: int, spacing: float | None = None
+) -> dict[str, Any]:
+    """Keyword arguments of `load_simulator`: as many cores as `workers`, be it for scenes side by
+    side or for one alone. The solver on a GPU has neither threads nor processes."""
+    options: dict[str, Any] = {"device": device}
+    if model == "mpm" and spacing is not None:
+        options["spacing"] = spacing
+    if model != "mpm" or device == "cpu":
+        options |= {"workers": workers, "threads": workers}
+    return options
 
 
 def _devices(device: Device) -> tuple[str, ...]:
@@ -171,7 +184,7 @@ def _on_data(
     from gns_model.simulator import load_simulator
     from gns_model.trajectory import Trajectory
 
-    simulator = load_simulator(model, device=_devices(device)[-1], workers=workers)
+    simulator = load_simulator(model, **simulator_options(model, _devices(device)[-1], workers))
     files = sorted(data.glob("*.h5"))[:count]
     if not files:
         raise GnsError(f"{data}: no trajectory files (*.h5)")

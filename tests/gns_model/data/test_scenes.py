@@ -74,6 +74,18 @@ def test_a_third_of_what_spreads_at_five_frictions_is_at_rest():
     assert {s.material.friction_angle for s in scenes} == {15.0, 22.5, 30.0, 37.5, 45.0}
 
 
+def test_rectangles_at_five_frictions_are_filled_to_their_sides():
+    scenes = [draw("rectangles-friction", 1, k) for k in range(60)]
+    sides = np.array([scene.releases[0].upper for scene in scenes])
+    aspects = sides[:, 1] / sides[:, 0]
+    assert 0.35 < aspects.min() < 0.45
+    assert 2.2 < aspects.max() < 2.9
+    for scene, (length, height) in zip(scenes, sides, strict=True):
+        assert scene.releases[0].lower == (0.0, 0.0)
+        assert len(fill(scene, 0.0125).positions) == round(length / 0.0125) * round(height / 0.0125)
+    assert [s.material.friction_angle for s in scenes[:6]] == [15.0, 22.5, 30.0, 37.5, 45.0, 15.0]
+
+
 def test_rows_are_tight_and_straight():
     scenes = [draw("rows", 0, k) for k in range(100)]
     for scene in scenes:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import inspect
 import json
 from pathlib import Path
 
@@ -9,7 +10,10 @@ from gns_model import console, paper
 from gns_model.cli import app
 from gns_model.learned import LearnedModel, ModelConfig
 from gns_model.learned.checkpoint import save_model
+from gns_model.learned.simulator import LearnedSimulator
 from gns_model.mpm import MpmSimulator
+from gns_model.mpm.torch_solver import TorchMpmSimulator
+from gns_model.suites.command import simulator_options
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
@@ -46,6 +50,22 @@ def test_one_suite_by_the_command_line(capsys, tmp_path: Path):
         "reference", "results.json", "upscaled.csv", "upscaled-curves.csv", "upscaled.png",
         "upscaled-frames.png",
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("model", ["mpm", "column-2d"])
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_every_simulator_takes_the_options_of_the_command(model: str, device: str):
+    simulators = {
+        ("mpm", "cpu"): MpmSimulator,
+        ("mpm", "cuda"): TorchMpmSimulator,
+    }
+    simulator = simulators.get((model, device), LearnedSimulator)
+    options = simulator_options(model, device, 3, 0.02 if model == "mpm" else None)
+    assert options.pop("device") == device
+    taken = inspect.signature(simulator.__init__).parameters
+    assert options.keys() <= taken.keys()
+    assert ("threads" in options) == ("threads" in taken)  # --workers is heard where it can be
+    assert ("spacing" in options) == (model == "mpm")
 
 
 def test_tables_and_warnings_for_a_person(capsys, plane_model: Path, tmp_path: Path):
