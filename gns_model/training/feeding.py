@@ -37,7 +37,7 @@ class Feeder:
     def unroll(self, step: int, progress: float) -> int:
         """How many steps the model takes in optimiser step `step`, `progress` into the budget."""
         recipe = self._recipe
-        if recipe.unroll == 1 or progress < 1 - recipe.unroll_fraction:
+        if recipe.unroll == 1 or not recipe.unrolled(progress):
             return 1
         rng = batches.generator(recipe.seed, batches.UNROLL, step)
         return int(rng.integers(1, recipe.unroll + 1))

@@ -200,6 +200,7 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: Stop) ->
                         "learning_rate": rate,
                         "gradient_norm": norm,
                         "edges_per_second": edges / (time.perf_counter() - began),
+                        "unrolled": recipe.unrolled(progress),
                     },
                 )
                 if bad >= PATIENCE:
@@ -258,7 +259,7 @@ def _forward_and_backward(
     """
     step, model = run.position.step, run.model
     context = torch.autocast(ranks.device.type, torch.bfloat16) if short else nullcontext()
-    unrolled = progress >= 1 - recipe.unroll_fraction
+    unrolled = recipe.unrolled(progress)
     kinematic = kinematic_spacing(recipe.model)
     rng = batches.generator(recipe.seed, batches.REPLAY, step)  # the same on all ranks
     run.optimiser.zero_grad(set_to_none=True)

@@ -54,6 +54,11 @@ def plot(out: Path) -> None:
     steps, losses = _columns(log, "step", "loss")
     rows[0].plot(steps, losses, color=TRAINING, lw=0.6, alpha=0.4)
     rows[0].plot(steps, smoothed(losses), color=TRAINING, lw=1.8, label="training, with noise")
+    x, share = _columns(log, "step", "unrolled")
+    if share.any() and not share[0]:  # the loss jumps here: it is asked for another thing
+        for axes in rows:
+            axes.axvline(x[share.argmax()], color=SCORE, lw=0.8, ls=":")
+        rows[0].plot([], [], color=SCORE, lw=0.8, ls=":", label="unrolled from here")
     rows[0].set_ylabel("loss: mean square of\nnormalised acceleration")
     if checks:
         x, y = _columns(checks, "step", "one_step")

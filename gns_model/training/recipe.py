@@ -123,6 +123,12 @@ class Recipe(BaseModel):
             )
         return self
 
+    def unrolled(self, progress: float) -> bool:
+        """Whether a step with `progress` in [0, 1] of the budget behind it belongs to the last
+        phase, which may ask for errors of states that the model itself made."""
+        several = self.unroll > 1 or self.replay > 0 or self.flow_share > 0
+        return several and progress >= 1 - self.unroll_fraction
+
     @classmethod
     def from_toml(cls, path: str | os.PathLike[str]) -> Recipe:
         """Read a recipe.

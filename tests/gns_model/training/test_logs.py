@@ -81,6 +81,16 @@ def test_a_table_drops_what_lies_beyond_and_a_row_that_was_cut_short(tmp_path):
     assert not Table(path, step=0).path.exists()
 
 
+@pytest.mark.parametrize(("unroll", "share"), [(1, 0.0), (2, 0.5)])
+def test_the_log_says_which_share_of_the_steps_was_of_the_unrolled_phase(
+    unroll, share, tiny, tmp_path
+):
+    settings = {"steps": 6, "unroll": unroll, "unroll_fraction": 0.5}
+    train(Recipe.from_dict({**tiny, "valid": [], **settings}), tmp_path)
+    rows = read_table(tmp_path / "log.csv")
+    assert np.mean([row["unrolled"] for row in rows]) == pytest.approx(share)
+
+
 def test_smoothing_is_a_mean_of_the_past():
     assert smoothed(np.full(50, 3.0)) == pytest.approx(np.full(50, 3.0))
     noisy = np.random.default_rng(0).normal(1.0, 0.5, 2000)
@@ -98,7 +108,7 @@ def test_the_loss_history_is_drawn_with_and_without_validation(tmp_path):
     assert not (tmp_path / "loss.png").exists()
     log = Table(tmp_path / "log.csv", step=0)
     for step in range(1, 200):
-        log.add({"step": step, "loss": 1 / step})
+        log.add({"step": step, "loss": 1 / step, "unrolled": step > 100})
     plot(tmp_path)
     low = imread(tmp_path / "loss.png").shape
     checks = Table(tmp_path / "validation.csv", step=0)
