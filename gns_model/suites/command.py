@@ -71,7 +71,7 @@ def evaluate(
     workers: Annotated[
         int,
         typer.Option(
-            min=1, help="Processes, or threads of the one that there is.", show_default="all cores"
+            min=1, help="Cores: scenes side by side, or threads of one.", show_default="all cores"
         ),
     ] = CORES,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
@@ -139,11 +139,15 @@ def simulator_options(
     """Keyword arguments of `load_simulator`: as many cores as `workers`, be it for scenes side by
     side or for one alone. The solver on a GPU has neither threads nor processes."""
     options: dict[str, Any] = {"device": device}
-    if model == "mpm" and spacing is not None:
-        options["spacing"] = spacing
-    if model != "mpm" or device == "cpu":
-        options |= {"workers": workers, "threads": workers}
-    return options
+    if model == "mpm":
+        if spacing is not None:
+            options["spacing"] = spacing
+        return options | ({"workers": workers, "threads": workers} if device == "cpu" else {})
+    import torch
+
+    # torch leaves out the second half of hyperthreaded cores, where products only wait
+    threads = min(workers, torch.get_num_threads())
+    return options | {"workers": workers, "threads": threads}
 
 
 def _devices(device: Device) -> tuple[str, ...]:
