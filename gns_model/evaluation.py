@@ -148,10 +148,15 @@ class Comparison:
         out["speedup"] = float(np.mean(known)) / max(seconds, 1e-9) if known else None
         return out
 
+    @property
+    def aims(self) -> dict[str, tuple[float, float]]:
+        """AIMS, which are for layouts: none over scenes without a baffle."""
+        return AIMS if any(r.scene.baffles for r in self.results) else {}
+
     def verdicts(self) -> dict[str, bool | None]:
-        """Which of AIMS are met; None where the number is undefined."""
+        """Which of the aims are met; None where the number is undefined."""
         numbers = self.aggregate()
-        return {name: _met(numbers[name], bounds) for name, bounds in AIMS.items()}
+        return {name: _met(numbers[name], bounds) for name, bounds in self.aims.items()}
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON, as they stand on a model's card."""
@@ -160,7 +165,7 @@ class Comparison:
             "reference": self.reference,
             "scenes": len(self.results),
             "aggregate": self.aggregate(),
-            "aims": {name: list(bounds) for name, bounds in AIMS.items()},
+            "aims": {name: list(bounds) for name, bounds in self.aims.items()},
             "met": self.verdicts(),
             "results": [r.to_dict() for r in self.results],
         }
@@ -195,30 +200,42 @@ class Comparison:
 
     def table(self) -> Table:
         """The aggregate for a terminal, with the aims beside it."""
-        numbers = self.aggregate()
+        numbers, aims = self.aggregate(), self.aims
         table = Table(
             title=f"{self.simulator} against {self.reference} over {len(self.results)} scenes"
         )
         table.add_column("measure", no_wrap=True)
-        for heading in ("error", "aim", "bias", "slope", "Spearman", "std", "std true"):
+        for heading in (
+            "error",
+            *(["aim"] if aims else []),
+            "bias",
+            "slope",
+            "Spearman",
+            "std",
+            "std true",
+        ):
             table.add_column(heading, justify="right", no_wrap=True)
         for name in JUDGED:
             cells = [
-                _cell(numbers[f"{name}.{key}"], form, AIMS.get(f"{name}.{key}"))
+                _cell(numbers[f"{name}.{key}"], form, aims.get(f"{name}.{key}"))
                 for key, form in (
                     ("error", ".1%"), ("bias", "+.1%"), ("slope", ".2f"), ("spearman", ".2f"),
                     ("spread", ".3f"), ("spread_true", ".3f"),
                 )
             ]  # fmt: skip
-            table.add_row(name, cells[0], f"{AIMS[f'{name}.error'][1]:.1%}", *cells[1:])
+            if aims:
+                cells.insert(1, f"{aims[f'{name}.error'][1]:.1%}")
+            table.add_row(name, *cells)
         speedup = numbers["speedup"]
         ratio = "" if speedup is None else f", {speedup:.2g} times the reference's speed"
         slope, rank = AIMS["centroid_travel.slope"], AIMS["centroid_travel.spearman"]
-        table.caption = (
+        of_layouts = (
             f"aims for the centroid: slope {slope[0]:g} to {slope[1]:g}, "
             f"Spearman at least {rank[0]:g}\n"
             f"points inside a baffle {numbers['points_inside']:.2%} (aim 0) · "
-            f"final points off by {numbers['point_rmse']:.3f} m · "
+        )
+        table.caption = (
+            (of_layouts if aims else "") + f"final points off by {numbers['point_rmse']:.3f} m · "
             f"mass in another {CELL * 100:g} cm cell {numbers['deposit_error']:.1%} · "
             f"{numbers['seconds']:.2f} s a rollout{ratio}"
         )

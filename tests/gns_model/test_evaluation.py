@@ -157,6 +157,17 @@ def test_a_simulator_that_does_not_answer_to_the_layout_is_found_out(references,
     assert verdicts["centroid_travel.spearman"] is None
 
 
+def test_scenes_without_baffles_are_not_held_to_the_aims_for_layouts(scenes):
+    bare = compare(Slide(1.3), Slide().rollout([s.with_baffles([]) for s in scenes]))
+    assert bare.verdicts() == {}
+    assert bare.to_dict()["aims"] == {}
+    console = Console(width=90, record=True, file=io.StringIO())
+    console.print(bare.table())
+    text = console.export_text()
+    assert "aim" not in text
+    assert "30.0%" in text
+
+
 def test_verdicts_follow_the_aims(references):
     good, bad = compare(Slide(1.005), references), compare(Slide(1.3), references)
     assert set(good.verdicts()) == set(AIMS)
