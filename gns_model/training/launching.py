@@ -35,7 +35,8 @@ def launch(
     """Train on `ranks` local processes and wait for them.
 
     SIGINT and SIGTERM are passed on: every rank finishes its step, the state is saved, and all
-    end. If one rank fails, the others are ended.
+    end. If one rank fails, the others save and are ended; one that was killed by a signal is named
+    on stderr.
 
     Args:
         recipe: path of the recipe.
@@ -97,6 +98,15 @@ def launch(
             codes = [process.poll() for process in processes]
             failed = [code for code in codes if code]
             if failed:
+                # The others may take the SIGTERM for the reason why they end, and one that was
+                # killed says nothing: without this line nobody would.
+                if log is None and failed[0] < 0:
+                    killed_by = signal.Signals(-failed[0]).name
+                    print(
+                        f"error: rank {codes.index(failed[0])} was killed by {killed_by}",
+                        file=sys.stderr,
+                        flush=True,
+                    )
                 pass_on(signal.SIGTERM, None)
                 deadline = time.monotonic() + PATIENCE
                 for process in processes:
