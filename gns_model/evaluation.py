@@ -205,15 +205,10 @@ class Comparison:
             title=f"{self.simulator} against {self.reference} over {len(self.results)} scenes"
         )
         table.add_column("measure", no_wrap=True)
-        for heading in (
-            "error",
-            *(["aim"] if aims else []),
-            "bias",
-            "slope",
-            "Spearman",
-            "std",
-            "std true",
-        ):
+        headings = ["error", "bias", "slope", "Spearman", "std", "std true"]
+        if aims:
+            headings.insert(1, "aim")
+        for heading in headings:
             table.add_column(heading, justify="right", no_wrap=True)
         for name in JUDGED:
             cells = [

@@ -16,6 +16,9 @@ from gns_model.scene import Scene
 #: Boxes along each side of a square of the family "spreading"; a box is whole spacings wide.
 PARTS = 6
 
+#: Spacing of points that a square of these families is made for [m].
+SPACING = 0.0125
+
 #: Width of a box with room for what runs far [m].
 WIDE = 2.0
 
@@ -41,17 +44,17 @@ def rectangle_friction_scene(rng: np.random.Generator, index: int) -> Scene:
     """A scene of the family "rectangles-friction". Sides are whole multiples of two spacings of the
     models, so that every filling of it is as large as the scene says."""
     aspect = np.exp(rng.uniform(np.log(0.4), np.log(2.5)))
-    area = rng.uniform(0.03, 0.10)
+    area, grid = rng.uniform(0.03, 0.10), 2 * SPACING
     sides = (math.sqrt(area / aspect), math.sqrt(area * aspect))
-    length, height = (round(0.025 * round(side / 0.025), 3) for side in sides)
-    # the runout of a low one of 15 degrees fits into the box
+    length, height = (round(grid * round(side / grid), 3) for side in sides)
+    at_rest_after = 5 * math.sqrt(height / 9.81)  # the paper's rest near 4 sqrt(H/g), and a bit
     return _column_box(
         (0.0, 0.0),
         (length, height),
         (0.0, 0.0),
         FRICTION_ANGLES[index % len(FRICTION_ANGLES)],
-        WIDE,
-        duration=round(max(1.0, 5 * math.sqrt(height / 9.81)), 2),
+        WIDE,  # the runout of a low one of 15 degrees fits in
+        duration=round(max(1.0, at_rest_after), 2),
     )
 
 
@@ -91,7 +94,7 @@ def _pressed(rng: np.random.Generator, friction_angle: float) -> Scene:
     The foot is several times as high as the square, so that it is stretched nearly evenly; speeds
     are what lifts its top by up to one and a half sizes.
     """
-    size = 0.0125 * PARTS * int(rng.integers(1, 6))
+    size = SPACING * PARTS * int(rng.integers(1, 6))
     at_wall, place = _stand(rng, size)
     speed = -rng.uniform(0.8, 1.7) * np.sqrt(9.81 * size) * (1.0 if at_wall else 0.5)
     foot = size * rng.uniform(2.0, 6.0)
@@ -103,7 +106,7 @@ def _spreading(rng: np.random.Generator, friction_angle: float, *, at_rest: floa
     """A square column whose foot spreads, but for a share `at_rest`. High columns fall and spread
     faster than squares at rest ever do, and a model that has seen only those leaves them standing.
     """
-    size = 0.0125 * PARTS * int(rng.integers(1, 7))
+    size = SPACING * PARTS * int(rng.integers(1, 7))
     at_wall, place = _stand(rng, size)
     speed = rng.uniform(-0.6, 1.8) * np.sqrt(9.81 * size)
     foot = size * np.exp(rng.uniform(np.log(0.4), np.log(3.0)))

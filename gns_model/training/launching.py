@@ -16,6 +16,9 @@ import torch.distributed as dist
 
 #: Seconds that the other ranks have to save and end when one has failed, or all were told to stop.
 PATIENCE = 30.0
+#: Seconds of it in which they are left alone: a rank that loses another in the middle of a step
+#: says so and saves, unless a SIGTERM comes first and looks like the reason.
+GRACE = 5.0
 
 #: Tells a rank which process started it.
 LAUNCHER = "GNS_LAUNCHER"
@@ -98,8 +101,7 @@ def launch(
             codes = [process.poll() for process in processes]
             failed = [code for code in codes if code]
             if failed:
-                # The others may take the SIGTERM for the reason why they end, and one that was
-                # killed says nothing: without this line nobody would.
+                # One that was killed says nothing itself.
                 if log is None and failed[0] < 0:
                     killed_by = signal.Signals(-failed[0]).name
                     print(
@@ -107,11 +109,10 @@ def launch(
                         file=sys.stderr,
                         flush=True,
                     )
+                _wait(processes, GRACE)
                 pass_on(signal.SIGTERM, None)
-                deadline = time.monotonic() + PATIENCE
+                _wait(processes, PATIENCE - GRACE)
                 for process in processes:
-                    with contextlib.suppress(subprocess.TimeoutExpired):
-                        process.wait(max(0.1, deadline - time.monotonic()))
                     process.kill()
                 return failed[0]
             if all(code == 0 for code in codes):
@@ -125,6 +126,14 @@ def launch(
         for process in processes:
             if process.poll() is None:
                 process.kill()
+
+
+def _wait(processes: Sequence[subprocess.Popen[bytes]], seconds: float) -> None:
+    """Until all have ended, or for `seconds`."""
+    deadline = time.monotonic() + seconds
+    for process in processes:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(max(0.0, deadline - time.monotonic()))
 
 
 def end_with_launcher() -> None:

@@ -130,7 +130,7 @@ def test_sigterm_saves_and_ends(tiny, tmp_path, write_recipe, way):
 
 @pytest.mark.slow
 def test_a_rank_that_dies_ends_the_run_with_what_was_learned(tiny, tmp_path, write_recipe):
-    """Rank 1 is killed: rank 0 saves the last whole step, and a line says what happened."""
+    """Rank 1 is killed: rank 0 saves the last whole step, and both lines say what happened."""
     values = {k: v for k, v in tiny.items() if k != "steps"} | {"minutes": 5, "valid": []}
     recipe, out = write_recipe(tmp_path / "long.toml", values), tmp_path / "run"
     command = [str(BIN / "gns-model"), "train", str(recipe), "--out", str(out), "--ranks", "2"]
@@ -147,6 +147,7 @@ def test_a_rank_that_dies_ends_the_run_with_what_was_learned(tiny, tmp_path, wri
         process.kill()
     assert process.returncode != 0
     assert "error: rank 1 was killed by SIGKILL" in errors
+    assert "error: lost the connection to another rank" in errors
     assert "Traceback" not in errors
     assert read_position(out / STATE).step > 0
 
