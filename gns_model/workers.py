@@ -28,6 +28,8 @@ _THREADS = {
 }
 _fractions: Any = None  # in a worker: one double a slot, how far the job in it has come
 SLOTS = 256
+#: The slot of jobs that found no other free; nobody reads it.
+SPARE = SLOTS - 1
 #: How often those who wait for jobs look at them [s].
 LOOK = 0.5
 
@@ -64,7 +66,7 @@ class Workers:
         # spawn: a forked process would inherit threads of torch and numba in an unknown state.
         context = multiprocessing.get_context("spawn")
         self._fractions = context.Array("d", SLOTS, lock=False)
-        self._free = list(range(SLOTS))
+        self._free = list(range(SPARE))
         with _environment(_THREADS):
             self._pool = ProcessPoolExecutor(
                 count,
@@ -76,14 +78,15 @@ class Workers:
     @postponed()
     def submit(self, job: Callable[..., Any], *arguments: Any) -> Job:
         """Queue `job(*arguments, slot)`; a worker calls it with a slot for `report`."""
-        slot = self._free.pop(0) if self._free else SLOTS - 1
+        slot = self._free.pop(0) if self._free else SPARE
         self._fractions[slot] = 0.0
         try:
             with _environment(_THREADS), deaf():  # it starts a process when a job needs one
                 future = self._pool.submit(job, *arguments, slot)
         except BrokenProcessPool:
             raise WorkerError(_DIED.format(self.advice)) from None
-        future.add_done_callback(lambda _: self._free.append(slot))
+        if slot != SPARE:
+            future.add_done_callback(lambda _: self._free.append(slot))
         return Job(future, self._fractions, slot, self.advice)
 
     def end(self) -> None:
@@ -121,8 +124,10 @@ class Job:
 
     @property
     def fraction(self) -> float:
-        """How far it is, 0 to 1."""
-        return 1.0 if self.done else min(float(self._fractions[self._slot]), 1.0)
+        """How far it is, 0 to 1; 0 until it is done if more than `SPARE` jobs wait."""
+        if self.done:
+            return 1.0
+        return 0.0 if self._slot == SPARE else min(float(self._fractions[self._slot]), 1.0)
 
     def result(self) -> Any:
         """What it returned; waits for it.

@@ -19,7 +19,6 @@ from gns_model.data.scenes import draw
 from gns_model.errors import FileFormatError, GnsError, SimulatorError
 from gns_model.scene import Scene
 from gns_model.trajectory import open_trajectory
-from gns_model.workers import Workers, as_completed
 
 #: Solvers of `gns_model.mpm`: on a CPU numba is some ten times faster; torch runs on GPUs.
 SOLVERS = ("numba", "torch")
@@ -111,30 +110,14 @@ def generate(
 
     todo = [(paths[i], draw(family, seed, i)) for i in missing]
     if solver == "numba":
-        _by_processes(todo, workers, spacing, frame_interval, report)
+        from gns_model.mpm.side_by_side import write_trajectories
+
+        settings = {"spacing": spacing, "frame_interval": frame_interval}
+        advice = "a rerun with fewer --workers goes on"
+        write_trajectories(todo, workers, settings, advice=advice, progress=report)
     else:
         _by_batches(todo, batch, spacing, frame_interval, device, report)
     return list(paths.values())
-
-
-def _by_processes(
-    todo: Sequence[tuple[Path, Scene]],
-    workers: int,
-    spacing: float | None,
-    interval: float,
-    report: Callable[[float], None],
-) -> None:
-    with Workers(min(workers, len(todo)), advice="a rerun with fewer --workers goes on") as pool:
-        jobs = [pool.submit(_make, path, scene, spacing, interval) for path, scene in todo]
-        for made, k in enumerate(as_completed(jobs), 1):
-            jobs[k].result()
-            report(made)
-
-
-def _make(path: Path, scene: Scene, spacing: float | None, interval: float, slot: int) -> None:
-    from gns_model.mpm import MpmSimulator
-
-    MpmSimulator(spacing=spacing, frame_interval=interval).rollout([scene])[0].save(path)
 
 
 def _by_batches(

@@ -15,6 +15,7 @@ from pathlib import Path
 from gns_model import mpm, particles
 from gns_model.errors import FileFormatError, SimulatorError
 from gns_model.mpm import MpmSimulator
+from gns_model.mpm.side_by_side import write_trajectories
 from gns_model.scene import Scene
 from gns_model.simulator import Progress
 from gns_model.trajectory import OK, Trajectory
@@ -37,7 +38,7 @@ def references(
     Args:
         interval: between frames [s].
         spacing: of the solver's points [m]; default: the solver's own.
-        threads: of the solver; its results do not depend on it.
+        threads: of the solver, or processes for several scenes; its results do not depend on it.
         stage: opens a progress bar, if there is anything to simulate.
 
     Raises:
@@ -49,18 +50,29 @@ def references(
     missing = [k for k, trajectory in enumerate(found) if trajectory is None]
     if missing:
         progress = stage(f"reference solver, {len(missing)} scene{'s' * (len(missing) > 1)}")
-        for done, k in enumerate(missing):
+        todo = [(files[k], scenes[k]) for k in missing]
+        if threads > 1 and len(missing) > 1:
+            write_trajectories(
+                todo,
+                threads,
+                {"spacing": spacing, "frame_interval": interval},
+                advice="a rerun with fewer --workers goes on",
+                progress=lambda done: progress(done / len(todo)),
+            )
+        else:
+            for done, (file, scene) in enumerate(todo):
 
-            def advance(fraction: float, done: int = done) -> None:
-                progress((done + fraction) / len(missing))
+                def advance(fraction: float, done: int = done) -> None:
+                    progress((done + fraction) / len(todo))
 
-            trajectory = solver.rollout([scenes[k]], progress=advance)[0]
+                solver.rollout([scene], progress=advance)[0].save(file)
+        for k in missing:
+            trajectory = Trajectory.load(files[k])
             if trajectory.status != OK:
                 raise SimulatorError(
                     f"the reference solver {trajectory.status} on scene {scenes[k].name!r}: "
                     "nothing can be held against it"
                 )
-            trajectory.save(files[k])
             found[k] = trajectory
     return [trajectory for trajectory in found if trajectory is not None]
 

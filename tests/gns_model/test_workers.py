@@ -51,6 +51,18 @@ def test_a_job_tells_how_far_it_is(workers):
     assert job.result() == "done"
 
 
+def test_a_job_without_a_slot_of_its_own_tells_nothing_before_it_is_done(workers, monkeypatch):
+    """More jobs than slots: the rest share one, and would all be as far as any of them."""
+    monkeypatch.setattr(workers, "_free", [])
+    job, looks = workers.submit(half_way), []
+    for _ in as_completed([job], lambda: looks.append(job.fraction)):
+        pass
+    assert len(looks) > 2
+    assert 0.5 not in looks
+    assert job.fraction == 1.0
+    assert workers._free == []  # the shared one is nobody's to give back
+
+
 def test_an_error_of_a_job_comes_back_as_it_was(workers):
     with pytest.raises(SceneError, match="cannot be"):
         workers.submit(refuse).result()

@@ -98,3 +98,24 @@ def test_a_reference_that_diverges_is_refused(plane_scene, tmp_path: Path, monke
     monkeypatch.setattr(MpmSimulator, "rollout", rollout)
     with pytest.raises(SimulatorError, match="reference solver diverged on scene 'plane'"):
         run([plane_scene], tmp_path)
+
+
+def test_side_by_side_keeps_the_same_files(plane_scene, simulated, tmp_path: Path):
+    """Several missing scenes on several cores: processes of one thread, a file each."""
+    scenes = [plane_scene, plane_scene.replace(name="other", duration=0.3)]
+    alone = run(scenes, tmp_path / "alone")
+    assert simulated == ["plane", "other"]
+    seen: list[float] = []
+    together = run(scenes, tmp_path / "together", threads=2, stage=lambda _: seen.append)
+    assert simulated == ["plane", "other"]  # not in this process
+    for one, other in zip(alone, together, strict=True):
+        assert one.scene == other.scene
+        np.testing.assert_array_equal(one.positions, other.positions)
+    assert seen == sorted(seen)
+    assert seen[-1] == 1.0
+    names = [
+        sorted(f.name for f in (tmp_path / who).rglob("*.h5")) for who in ("alone", "together")
+    ]
+    assert names[0] == names[1]
+    run(scenes, tmp_path / "together", threads=2)
+    assert simulated == ["plane", "other"]

@@ -1,0 +1,51 @@
+"""Many scenes, a file each: one-thread processes side by side, each writing what it has finished.
+
+A 2D scene is too small for threads: beside other work four of them take five times as long as one,
+or more, and processes scale (findings/SPEED.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from gns_model.mpm.solver import MpmSimulator
+from gns_model.scene import Scene
+from gns_model.workers import Workers, as_completed, report
+
+
+def write_trajectories(
+    todo: Sequence[tuple[Path, Scene]],
+    workers: int,
+    settings: Mapping[str, Any],
+    *,
+    advice: str,
+    progress: Callable[[float], None],
+) -> None:
+    """Simulate every scene and write its trajectory to its path, whole, as soon as it is there.
+
+    Args:
+        todo: paths of HDF5 files and the scenes that go into them; a file there is replaced.
+        workers: processes, one thread each.
+        settings: keyword arguments of `MpmSimulator`.
+        advice: what to do if a process dies, in words.
+        progress: called with the number of scenes done, parts of scenes included.
+
+    Raises:
+        WorkerError: if a process dies.
+        SimulatorError, SceneError: if the solver cannot run a scene.
+    """
+    with Workers(min(workers, len(todo)), advice=advice) as pool:
+        jobs = [pool.submit(_write, path, scene, dict(settings)) for path, scene in todo]
+
+        def look() -> None:
+            progress(sum(job.fraction for job in jobs))
+
+        for k in as_completed(jobs, look):
+            jobs[k].result()
+            look()
+
+
+def _write(path: Path, scene: Scene, settings: dict[str, Any], slot: int) -> None:
+    MpmSimulator(**settings).rollout([scene], progress=report(slot))[0].save(path)
