@@ -76,7 +76,7 @@ def generate(
         device: "cpu", or for the torch solver "cuda".
         batch: scenes that the torch solver advances at once; their files appear together.
         shard: (i, n): make only trajectories i, i + n, i + 2n, ...
-        progress: called with (finished, all) of this shard.
+        progress: called with (finished, all) of this shard; parts of trajectories count.
 
     Returns:
         The files of this shard.
