@@ -1,5 +1,5 @@
 """Reference solver: particle-substeps per CPU second, beside a plain NumPy transfer of the same
-points in the same run. `python benchmarks/mpm.py`"""
+points in the same run, and what threads are worth. `python benchmarks/mpm.py`"""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import time
 import numpy as np
 
 from gns_model import paper
-from gns_model.mpm import MpmSimulator
+from gns_model.mpm import MpmSimulator, solver
 from gns_model.mpm.problem import DEFAULT_SPACING
 from gns_model.particles import fill
 
@@ -49,6 +49,19 @@ def numpy_rate(scene, repeats=3):
     return repeats * len(f) / (time.process_time() - began)
 
 
+def threads_ratio(scene, spacing, seconds_of_flow, threads=4):
+    """Number of points, and the time of `threads` threads in shares of that of one."""
+    solver.THREAD_POINTS = 0
+    spent = []
+    for count in (1, threads):
+        simulator = MpmSimulator(spacing=spacing, threads=count)
+        simulator.rollout([scene.replace(duration=0.01)])
+        began = time.perf_counter()
+        simulator.rollout([scene.replace(duration=seconds_of_flow)])
+        spent.append(time.perf_counter() - began)
+    return len(fill(scene, spacing).positions), spent[1] / spent[0]
+
+
 def main():
     cases = {
         "2D column a = 1": (paper.column_scene(paper.COLUMNS[2]), 0.3),
@@ -60,6 +73,12 @@ def main():
             f"{name:16s} {ours / 1e6:5.2f} million particle-substeps per CPU second, "
             f"{ours / plain:4.1f} times NumPy's bare transfer ({plain / 1e6:.2f})"
         )
+    column, flume = cases["2D column a = 1"][0], cases["3D flume"][0]
+    print("time of four threads in shares of that of one:")
+    for scene, spacings in ((column, (0.0125, 0.00625, 0.003)), (flume, (0.03, 0.02, 0.015625))):
+        for spacing in spacings:
+            points, ratio = threads_ratio(scene, spacing, 0.03)
+            print(f"  {scene.dim}D {points:6d} points {ratio:5.2f}", flush=True)
 
 
 if __name__ == "__main__":

@@ -26,6 +26,10 @@ from gns_model.workers import Workers, as_completed
 if "NUMBA_THREADING_LAYER" not in os.environ:
     numba.config.THREADING_LAYER = "workqueue"  # type: ignore[attr-defined]
 _ONE_CALLER = threading.Lock()
+#: Points from which threads are worth their meetings in every substep. Four of them take twenty
+#: times as long as one for 600 points in 2D, twice for 4,000 in 3D, the same for 10,000 in 2D and
+#: two thirds for 31,000 in 3D (`benchmarks/mpm.py`).
+THREAD_POINTS = 15_000
 
 
 class MpmSimulator:
@@ -36,7 +40,8 @@ class MpmSimulator:
             wide. Default: 0.015625 in 3D and 0.0125 in 2D, which gives the paper's elements.
         frame_interval: time between stored frames [s].
         cfl: share of the stable substep that is used.
-        threads: threads of one rollout; results do not depend on it. Default 1.
+        threads: most threads of one rollout, of which one of fewer than `THREAD_POINTS` points
+            uses one; results do not depend on it. Default 1.
         workers: processes that roll out several scenes side by side, one thread each.
         damping_rate: see DAMPING_RATE [1/s].
     """
@@ -68,6 +73,11 @@ class MpmSimulator:
     def settings(self) -> dict[str, Any]:
         """The arguments that this simulator was made with."""
         return {**asdict(self.chosen), "threads": self.threads, "workers": self.workers}
+
+    def threads_for(self, count: int) -> int:
+        """Threads that a rollout of `count` points uses."""
+        most: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+        return min(self.threads, most) if count >= THREAD_POINTS else 1
 
     def check(self, scene: Scene) -> None:
         """Raise SimulatorError if `scene` would not fit in memory."""
@@ -127,7 +137,7 @@ class MpmSimulator:
         positions[0] = start.positions
         bad_frame = None
         spare, spare_ids = np.empty_like(points), np.empty_like(ids)
-        threads = min(self.threads, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+        threads = self.threads_for(count)
         threads_before = numba.get_num_threads()
         try:
             for frame in range(1, frames + 1):

@@ -179,7 +179,8 @@ def test_plane_strain_is_a_wide_3d_flow_without_side_friction():
 PROGRAM = """
 import hashlib, sys
 from gns_model.data.scenes import draw
-from gns_model.mpm import MpmSimulator
+from gns_model.mpm import MpmSimulator, solver
+solver.THREAD_POINTS = 0  # or a small scene would have one thread
 scene = draw("layouts", 5, 0).replace(duration=0.1)
 positions = MpmSimulator(spacing=0.03, threads=int(sys.argv[1])).rollout([scene])[0].positions
 print(hashlib.sha256(positions.tobytes()).hexdigest())
@@ -201,6 +202,13 @@ def test_one_and_four_threads_agree_to_the_last_bit():
     one, four = digest(1), digest(4)
     assert len(one) == len(hashlib.sha256().hexdigest())
     assert one == four
+
+
+def test_a_small_scene_has_one_thread():
+    """Threads that meet in every substep of a small scene take many times as long as one."""
+    simulator = MpmSimulator(threads=4)
+    assert simulator.threads_for(solver.THREAD_POINTS - 1) == 1
+    assert simulator.threads_for(solver.THREAD_POINTS) == min(4, numba.config.NUMBA_NUM_THREADS)
 
 
 def test_workers_return_what_one_process_returns():
