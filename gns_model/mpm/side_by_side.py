@@ -1,7 +1,7 @@
 """Many scenes, a file each: one-thread processes side by side, each writing what it has finished.
 
-A 2D scene is too small for threads: beside other work four of them take five times as long as one,
-or more, and processes scale (findings/SPEED.md).
+A 2D scene is too small for threads, of which four take up to twenty times as long as one
+(`benchmarks/mpm.py`), and processes scale.
 """
 
 from __future__ import annotations
