@@ -113,8 +113,7 @@ def generate(
         from gns_model.mpm.side_by_side import write_trajectories
 
         settings = {"spacing": spacing, "frame_interval": frame_interval}
-        advice = "a rerun with fewer --workers goes on"
-        write_trajectories(todo, workers, settings, advice=advice, progress=report)
+        write_trajectories(todo, workers, settings, progress=report)
     else:
         _by_batches(todo, batch, spacing, frame_interval, device, report)
     return list(paths.values())

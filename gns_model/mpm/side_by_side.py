@@ -20,7 +20,6 @@ def write_trajectories(
     workers: int,
     settings: Mapping[str, Any],
     *,
-    advice: str,
     progress: Callable[[float], None],
 ) -> None:
     """Simulate every scene and write its trajectory to its path, whole, as soon as it is there.
@@ -29,14 +28,13 @@ def write_trajectories(
         todo: paths of HDF5 files and the scenes that go into them; a file there is replaced.
         workers: processes, one thread each.
         settings: keyword arguments of `MpmSimulator`.
-        advice: what to do if a process dies, in words.
         progress: called with the number of scenes done, parts of scenes included.
 
     Raises:
         WorkerError: if a process dies.
         SimulatorError, SceneError: if the solver cannot run a scene.
     """
-    with Workers(min(workers, len(todo)), advice=advice) as pool:
+    with Workers(min(workers, len(todo)), advice="a rerun with fewer --workers goes on") as pool:
         jobs = [pool.submit(_write, path, scene, dict(settings)) for path, scene in todo]
 
         def look() -> None:

@@ -56,7 +56,6 @@ def references(
                 todo,
                 threads,
                 {"spacing": spacing, "frame_interval": interval},
-                advice="a rerun with fewer --workers goes on",
                 progress=lambda done: progress(done / len(todo)),
             )
         else:
