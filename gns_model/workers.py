@@ -161,6 +161,27 @@ def as_completed(jobs: list[Job], watch: Callable[[], None] | None = None) -> It
             yield ready
 
 
+def results(jobs: list[Job], progress: Callable[[float], None] | None = None) -> list[Any]:
+    """What `jobs` return, in their order; waits for all, or for the first that fails.
+
+    Args:
+        progress: called with the fraction done, of jobs under way, too.
+
+    Raises:
+        WorkerError: if a process died; else whatever a job raised.
+    """
+    found: dict[int, Any] = {}
+
+    def look() -> None:
+        if progress is not None:
+            progress(sum(job.fraction for job in jobs) / len(jobs))
+
+    for k in as_completed(jobs, look):
+        found[k] = jobs[k].result()
+        look()
+    return [found[k] for k in range(len(jobs))]
+
+
 def report(slot: int) -> Callable[[float], None]:
     """In a worker: a progress callback that writes to `slot`."""
 

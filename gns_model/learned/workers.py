@@ -15,7 +15,7 @@ from gns_model.particles import fill
 from gns_model.scene import Scene
 from gns_model.simulator import Progress
 from gns_model.trajectory import Trajectory
-from gns_model.workers import Workers, as_completed
+from gns_model.workers import Workers, report, results
 
 #: Points that one task should have: small scenes share a task, large ones have their own.
 TASK_POINTS = 4_000
@@ -49,19 +49,15 @@ class WorkerPool:
         sizes = [len(fill(scene, self.spacing).positions) for scene in scenes]
         even = -(-sum(sizes) // self.workers)
         tasks = list(groups(sizes, min(TASK_POINTS, even)))
-        done: dict[int, list[Trajectory]] = {}
         try:
             jobs = [
                 self._pool.submit(_rollout, [scenes[k].to_dict() for k in task]) for task in tasks
             ]
-            for number in as_completed(jobs):
-                done[number] = jobs[number].result()
-                if progress is not None:
-                    progress(len(done) / len(tasks))
+            shares = results(jobs, progress)
         except BaseException:
             self.close()
             raise
-        return [trajectory for number in range(len(tasks)) for trajectory in done[number]]
+        return [trajectory for share in shares for trajectory in share]
 
     def close(self) -> None:
         """End the processes, at once and with whatever they were doing."""
@@ -79,4 +75,4 @@ def _start(config: str, state: dict[str, Any], name: str, options: dict[str, Any
 
 def _rollout(scenes: list[dict[str, Any]], slot: int) -> list[Trajectory]:
     assert _simulator is not None
-    return _simulator.rollout([Scene.from_dict(scene) for scene in scenes])
+    return _simulator.rollout([Scene.from_dict(scene) for scene in scenes], progress=report(slot))

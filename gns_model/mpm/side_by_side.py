@@ -12,7 +12,7 @@ from typing import Any
 
 from gns_model.mpm.solver import MpmSimulator
 from gns_model.scene import Scene
-from gns_model.workers import Workers, as_completed, report
+from gns_model.workers import Workers, report, results
 
 
 def write_trajectories(
@@ -36,13 +36,7 @@ def write_trajectories(
     """
     with Workers(min(workers, len(todo)), advice="a rerun with fewer --workers goes on") as pool:
         jobs = [pool.submit(_write, path, scene, dict(settings)) for path, scene in todo]
-
-        def look() -> None:
-            progress(sum(job.fraction for job in jobs))
-
-        for k in as_completed(jobs, look):
-            jobs[k].result()
-            look()
+        results(jobs, lambda fraction: progress(fraction * len(jobs)))
 
 
 def _write(path: Path, scene: Scene, settings: dict[str, Any], slot: int) -> None:

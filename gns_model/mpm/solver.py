@@ -18,7 +18,7 @@ from gns_model.mpm.transfer import COLUMNS, NODE_COLUMNS, POSITION, advance, adv
 from gns_model.scene import Scene
 from gns_model.simulator import Progress
 from gns_model.trajectory import Trajectory
-from gns_model.workers import Workers, as_completed
+from gns_model.workers import Workers, report, results
 
 # numba's OpenMP layer sets the number of threads of the whole process, torch's included, whose
 # one-thread rollouts then fight for all cores, many times slower. Its own layer leaves torch
@@ -99,23 +99,18 @@ class MpmSimulator:
         for scene in scenes:
             self.check(scene)
         total = max(len(scenes), 1)
-        if self.workers == 1 or len(scenes) == 1:
-            results = []
+        if self.workers == 1 or len(scenes) <= 1:
+            trajectories = []
             for n, scene in enumerate(scenes):
                 inner = None
                 if progress is not None:
                     inner = lambda f, n=n: progress((n + f) / total)  # noqa: E731
-                results.append(self._rollout_one(scene, inner))
-            return results
+                trajectories.append(self._rollout_one(scene, inner))
+            return trajectories
         single = {**self.settings(), "workers": 1, "threads": 1}
-        done: dict[int, Trajectory] = {}
         with Workers(min(self.workers, len(scenes))) as pool:
             jobs = [pool.submit(_rollout_job, single, scene) for scene in scenes]
-            for k in as_completed(jobs):
-                done[k] = jobs[k].result()
-                if progress is not None:
-                    progress(len(done) / total)
-        return [done[n] for n in range(len(scenes))]
+            return results(jobs, progress)
 
     def _rollout_one(self, scene: Scene, progress: Progress | None) -> Trajectory:
         started = time.perf_counter()
@@ -166,4 +161,4 @@ class MpmSimulator:
 
 
 def _rollout_job(settings: dict[str, Any], scene: Scene, slot: int) -> Trajectory:
-    return MpmSimulator(**settings).rollout([scene])[0]
+    return MpmSimulator(**settings).rollout([scene], progress=report(slot))[0]

@@ -6,7 +6,7 @@ import time
 import pytest
 
 from gns_model.errors import SceneError
-from gns_model.workers import WorkerError, Workers, as_completed, report
+from gns_model.workers import WorkerError, Workers, as_completed, report, results
 from tests.interrupt import Interrupt
 
 
@@ -49,6 +49,24 @@ def test_a_job_tells_how_far_it_is(workers):
     assert 0.5 in looks
     assert job.fraction == 1.0
     assert job.result() == "done"
+
+
+def test_results_come_in_the_order_of_their_jobs_and_tell_how_far_all_of_them_are(workers):
+    looks = []
+    found = results([workers.submit(half_way), workers.submit(double, 4)], looks.append)
+    assert found[0] == "done"
+    assert found[1][0] == 8
+    assert looks == sorted(looks)
+    assert 0.75 in looks, "one done, the other half way"
+    assert looks[-1] == 1.0
+
+
+def test_results_end_with_the_first_job_that_fails(workers):
+    jobs = [workers.submit(refuse), *(workers.submit(half_way) for _ in range(4))]
+    with pytest.raises(SceneError, match="cannot be"):
+        results(jobs)
+    assert not all(job.done for job in jobs), "it does not wait for the others"
+    list(as_completed(jobs))
 
 
 def test_a_job_without_a_slot_of_its_own_tells_nothing_before_it_is_done(workers, monkeypatch):
