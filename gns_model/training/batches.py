@@ -47,12 +47,15 @@ class Batch:
         moves: true displacement of each coming step [m], shape (N, K, D).
         world: what surrounds the points.
         moving: mask of the points that the loss is about, shape (N,); None: all.
+        back: the part of the first move that leads drifted points back to the truth [m], shape
+            (N, D); None: no move has one.
     """
 
     history: Tensor
     moves: Tensor
     world: World
     moving: Tensor | None = None
+    back: Tensor | None = None
 
 
 def generator(seed: int, purpose: int, step: int, rank: int = 0) -> np.random.Generator:

@@ -295,6 +295,7 @@ def _forward_and_backward(
                 Emphasis.of(recipe),
                 batch=batch.world.batch,
                 moving=batch.moving,
+                back=batch.back,
             )
         replay.advanced(after)
     else:

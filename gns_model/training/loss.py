@@ -42,7 +42,10 @@ class Emphasis:
         relative_to: an acceleration q [standard deviations]. Errors are divided by
             sqrt(s² + q²), s the root mean square of what is asked of the scene. A scene in
             violent motion has large errors for a few steps, and a slow one small errors for so many
-            that they decide where it stops.
+            that they decide where it stops. Where a way back is a part of what is asked, s² is the
+            sum of the squares of that and of what the model gives: the way back is a draw that no
+            state foretells, and divided by their sum those that cancel the motion would count for
+            more than those that go with it, so that everything would be asked to stand still.
     """
 
     linear_beyond: float | None = None
@@ -71,6 +74,7 @@ def step_error(
     *,
     batch: Tensor | None = None,
     moving: Tensor | None = None,
+    back: Tensor | None = None,
 ) -> Tensor:
     """Mean square of the normalised acceleration error, a scalar.
 
@@ -85,18 +89,23 @@ def step_error(
         emphasis: what weighs more.
         batch: scene of every point, shape (N,); default: all in one.
         moving: mask of the points that count, shape (N,); default: all.
+        back: the part of `move` that leads back to the truth [m], shape (N, D); default: none.
     """
     place, error = history[:, -1], (after - history[:, -1]) - move
-    asked = move - (history[:, -1] - history[:, -2])
+    before = (history[:, -1] - history[:, -2]).detach()
+    if back is None:
+        strength = (move - before).square()
+    else:
+        strength = (after.detach() - place.detach() - before).square() + back.square()
     if moving is not None:
-        place, error, asked = place[moving], error[moving], asked[moving]
+        place, error, strength = place[moving], error[moving], strength[moving]
         batch = None if batch is None else batch[moving]
     if batch is None:
         batch = torch.zeros(len(error), dtype=torch.long, device=error.device)
     unit = model.config.dt**2 * model.acceleration_std
     error, linear_beyond = error / unit, emphasis.linear_beyond
     if emphasis.relative_to is not None:
-        strong = _scene_mean((asked / unit).square(), batch).mean(1, keepdim=True)
+        strong = _scene_mean(strength / unit.square(), batch).mean(1, keepdim=True)
         error = error / (strong + emphasis.relative_to**2).sqrt()[batch]
 
     def over_points(squares: Tensor) -> Tensor:
@@ -173,9 +182,16 @@ def unrolled_loss(
             the model learns to push back.
     """
 
-    def error(after: Tensor, move: Tensor) -> Tensor:
+    def error(after: Tensor, move: Tensor, back: Tensor | None = None) -> Tensor:
         return step_error(
-            model, history, after, move, emphasis, batch=batch.world.batch, moving=batch.moving
+            model,
+            history,
+            after,
+            move,
+            emphasis,
+            batch=batch.world.batch,
+            moving=batch.moving,
+            back=back,
         )
 
     history = batch.history
@@ -184,11 +200,12 @@ def unrolled_loss(
             for _ in range(steps - 1):
                 after = model.step(history, batch.world)
                 history = torch.cat([history[:, 1:], after[:, None]], dim=1)
-        move = batch.moves[:, steps - 1]
+        move, back = batch.moves[:, steps - 1], batch.back
         if return_steps is not None and steps > 1:
             truth = batch.history[:, -1] + batch.moves[:, : steps - 1].sum(1)
-            move = move - (history[:, -1] - truth) / return_steps
-        return error(model.step(history, batch.world), move)
+            back = (truth - history[:, -1]) / return_steps
+            move = move + back
+        return error(model.step(history, batch.world), move, back)
     total = batch.moves.new_zeros(())
     for k in range(steps):
         after = model.step(history, batch.world)

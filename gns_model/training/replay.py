@@ -27,6 +27,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 from torch import Tensor
@@ -96,16 +97,18 @@ class Replay:
                 rng = self._rng(batches.NOISE, step, len(self._taken))
                 flow.history = _noisy(truth, recipe.model.noise_std, rng)
             self._taken.append((flow, truth))
-        own = []
+        own, backs = [], []
         for flow, truth in self._taken:
             assert flow.history is not None
-            move = wish(flow.history, truth, recipe.return_steps or 1.0)
+            move, back = wish(flow.history, truth, recipe.return_steps or 1.0)
             after = flow.history[:, -1:] + move[:, None]
             own.append(dataclasses.replace(truth, history=flow.history, future=after))
-        batch = batches.collate(
-            own, noise_std=0.0, rng=self._rng(batches.NOISE, step), device=self._ranks.device
-        )
-        return batch, edges
+            backs.append(back)
+        device = self._ranks.device
+        rng = self._rng(batches.NOISE, step)
+        batch = batches.collate(own, noise_std=0.0, rng=rng, device=device)
+        ways = torch.from_numpy(np.concatenate(backs)).to(device)
+        return dataclasses.replace(batch, back=ways), edges
 
     def advanced(self, after: Tensor) -> None:
         """What the model makes of the flows taken: positions [m], shape (N, D)."""
@@ -199,8 +202,9 @@ class Replay:
         return np.random.default_rng([self._recipe.seed, purpose, *numbers, self._ranks.rank])
 
 
-def wish(history: np.ndarray, window: Window, return_steps: float) -> np.ndarray:
-    """The displacement to ask for [m], shape (N, D): the module's equation, times dt², and v dt.
+def wish(history: np.ndarray, window: Window, return_steps: float) -> tuple[np.ndarray, np.ndarray]:
+    """The displacement to ask for [m], shape (N, D): the module's equation, times dt², and v dt;
+    and the part of it that leads back.
 
     Args:
         history: the model's positions [m], shape (N, H+1, D).
@@ -209,9 +213,9 @@ def wish(history: np.ndarray, window: Window, return_steps: float) -> np.ndarray
     truth = window.history
     error, before = history[:, -1] - truth[:, -1], history[:, -2] - truth[:, -2]
     acceleration = window.future[:, 0] - 2 * truth[:, -1] + truth[:, -2]
-    back = 2 * (error - before) / return_steps + error / return_steps**2
-    move: np.ndarray = history[:, -1] - history[:, -2] + acceleration - back
-    return move.astype(np.float32)
+    back = -(2 * (error - before) / return_steps + error / return_steps**2)
+    move = history[:, -1] - history[:, -2] + acceleration + back
+    return move.astype(np.float32), back.astype(np.float32)
 
 
 def _noisy(window: Window, std: float, rng: np.random.Generator) -> np.ndarray:

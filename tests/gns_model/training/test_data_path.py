@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import brentq
 
 from gns_model.data.windows import WindowIndex
 from gns_model.learned.config import ModelConfig
@@ -380,6 +381,32 @@ def test_errors_count_relative_to_what_accelerates_the_scene(free_flight):
     assert cost(1.0, relative_to=4.0, scenes_alike=True) == pytest.approx(expected, rel=1e-2)
     alone = cost(1.0, relative_to=4.0, scenes_alike=True, momentum_weight=1.0)
     assert alone == pytest.approx(2 * expected, rel=1e-2)
+
+
+def test_a_way_back_that_no_state_foretells_leaves_the_motion_as_it_is(free_flight):
+    """Scenes that all brake at 1 deviation and have drifted by chance, some ahead, some behind:
+    what costs least is to brake at 1. Weighed by all that is asked, those that are asked to stop
+    braking count for more than those that are asked to brake harder, and 0.2 would cost less."""
+    net, batch = ballistic(free_flight)
+    now, before = batch.history[:, -1], batch.history[:, -2]
+    scene = torch.arange(len(now))
+    unit = DT**2 * net.acceleration_std
+    chance = torch.linspace(-1.5, 1.5, len(now))[:, None] * unit
+    move = now - before - unit + chance
+
+    def settles(back):
+        """Where the gradient leads: the braking at which it changes sign."""
+
+        def slope(braking):
+            given = torch.tensor(braking, requires_grad=True)
+            after, weighing = now + (now - before) - given * unit, Emphasis(relative_to=0.3)
+            step_error(net, batch.history, after, move, weighing, batch=scene, back=back).backward()
+            return float(given.grad)
+
+        return brentq(slope, -0.5, 3.0)
+
+    assert settles(chance) == pytest.approx(1.0, abs=0.05)
+    assert settles(None) < 0.5
 
 
 def test_a_drift_is_asked_back(free_flight):
