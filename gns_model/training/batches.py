@@ -23,7 +23,7 @@ from gns_model.training.noise import random_walk
 from gns_model.training.statistics import Statistics
 
 #: Purposes of random generators.
-DRAW, NOISE, UNROLL, REPLAY, FLOWS = 1, 2, 3, 4, 5
+DRAW, NOISE, UNROLL, REPLAY, FLOWS, REMEMBER, RECALL = 1, 2, 3, 4, 5, 6, 7
 
 
 @dataclass(frozen=True)

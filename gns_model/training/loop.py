@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 import torch
@@ -284,20 +284,7 @@ def _forward_and_backward(
         )
         return loss, sum(flow.edges for flow in flows)
     if recipe.replay and unrolled and rng.random() < recipe.replay_share:
-        batch, edges = replay.take(step)
-        with context:
-            after = model.step(batch.history, batch.world)
-            loss = step_error(
-                model,
-                batch.history,
-                after,
-                batch.moves[:, 0],
-                Emphasis.of(recipe),
-                batch=batch.world.batch,
-                moving=batch.moving,
-                back=batch.back,
-            )
-        replay.advanced(after)
+        loss, edges = _replayed(run, recipe, replay, context)
     else:
         windows, edges = feeder.take(step, progress)
         batch = batches.collate(
@@ -316,6 +303,34 @@ def _forward_and_backward(
                 return_steps=recipe.return_steps,
             )
     loss.backward()
+    return loss, edges
+
+
+def _replayed(
+    run: Run, recipe: Recipe, replay: Replay, context: AbstractContextManager[None]
+) -> tuple[Tensor, float]:
+    """Loss of states that the model made, whose flows go on, and the number of edges."""
+    step, model = run.position.step, run.model
+    batch, edges = replay.take(step)
+    recalled = replay.recall(step)
+    if recalled is not None:
+        with torch.no_grad(), context:
+            replay.advanced(model.step(batch.history, batch.world))
+        batch, edges = recalled
+    with context:
+        after = model.step(batch.history, batch.world)
+        loss = step_error(
+            model,
+            batch.history,
+            after,
+            batch.moves[:, 0],
+            Emphasis.of(recipe, replayed=True),
+            batch=batch.world.batch,
+            moving=batch.moving,
+            back=batch.back,
+        )
+    if recalled is None:
+        replay.advanced(after)
     return loss, edges
 
 

@@ -56,9 +56,12 @@ class Emphasis:
     relative_to: float | None = None
 
     @classmethod
-    def of(cls, recipe: Recipe) -> Emphasis:
-        """What a recipe asks for under the same names."""
-        return cls(**{f.name: getattr(recipe, f.name) for f in fields(cls)})
+    def of(cls, recipe: Recipe, *, replayed: bool = False) -> Emphasis:
+        """What a recipe asks for under the same names; of replayed states, if it says so."""
+        values = {f.name: getattr(recipe, f.name) for f in fields(cls)}
+        if replayed and recipe.replay_relative_to is not None:
+            values["relative_to"] = recipe.replay_relative_to
+        return cls(**values)
 
 
 #: The paper's: the plain mean of squares.

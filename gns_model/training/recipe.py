@@ -90,6 +90,11 @@ class Recipe(BaseModel):
     #: learns late what it does wrong. See `replay`. 0: none.
     replay: Annotated[int, Field(ge=0)] = 0
     replay_steps: Count = 40
+    #: States of those flows that each rank keeps and trains on, in place of those of the moment,
+    #: which make it swing: about what the flows make in ten times `replay_steps` turns. 0: none.
+    replay_memory: Annotated[int, Field(ge=0)] = 0
+    #: `relative_to` of their states, whose way back would drown the rest; none: as of all others.
+    replay_relative_to: Positive | None = None
     #: Share of the steps that are about them; the others look at true states and keep them right.
     replay_share: Fraction = 0.5
     #: Share of the steps of the unrolled phase, taken before that of `replay`, that train through

@@ -17,6 +17,12 @@ tens of g for the wanderings of single grains that nobody can foretell.
 The way back closes a control loop, and the pool is its delay: what the weights of now do wrong
 shows at the end of a flow, after `replay_steps` turns of that flow. So keep few flows, about as
 many as a batch holds.
+
+That delay makes the loop swing: heaps stand, then slump, then stand. A memory damps it, by which
+the aggregation is one of all the models so far and no longer of the last alone: a turn rolls the
+flows on without a gradient, every state of theirs is kept in place of a random older one, and the
+gradient is of states drawn from all that are kept. Its horizon, the turns in which the memory
+is replaced, should be several times as long as a flow.
 """
 
 from __future__ import annotations
@@ -60,12 +66,26 @@ class Rolling:
     history: np.ndarray | None = None
 
 
+@dataclass(frozen=True)
+class Memory:
+    """A state that the model made once.
+
+    Attributes:
+        draw: its source, mixture of tracers and frame.
+        history: the model's positions [m], shape (N, H+1, D).
+    """
+
+    draw: Draw
+    history: np.ndarray
+
+
 class Replay:
     """This rank's flows. What is drawn follows from the seed and from how many were drawn before.
 
     Args:
         data: where flows begin, and what they should have done.
-        recipe: `replay` flows are kept, for up to `replay_steps` steps each.
+        recipe: `replay` flows are kept, for up to `replay_steps` steps each, and `replay_memory`
+            states of them.
     """
 
     def __init__(
@@ -76,6 +96,8 @@ class Replay:
         self._kinematic = kinematic_spacing(recipe.model)
         self.drawn = 0
         self.flows: list[Rolling] = []
+        self.remembered = 0
+        self.memories: list[Memory] = []
         self._taken: list[tuple[Rolling, Window]] = []
         self._after: Tensor | None = None
 
@@ -97,18 +119,35 @@ class Replay:
                 rng = self._rng(batches.NOISE, step, len(self._taken))
                 flow.history = _noisy(truth, recipe.model.noise_std, rng)
             self._taken.append((flow, truth))
+        states = [(flow.history, truth) for flow, truth in self._taken if flow.history is not None]
+        return self._asked(states), edges
+
+    def recall(self, step: int) -> tuple[Batch, float] | None:
+        """States from memory as a batch, and about how many edges it has; None: there are none
+        yet."""
+        if not self.memories:
+            return None
+        rng, edges = self._rng(batches.RECALL, step), 0.0
+        states: list[tuple[np.ndarray, Window]] = []
+        while True:
+            memory = self.memories[int(rng.integers(len(self.memories)))]
+            if states and edges + memory.draw.edges / 2 > self._recipe.edges_per_batch:
+                return self._asked(states), edges
+            edges += memory.draw.edges
+            truth = batches.read(self._data, memory.draw, unroll=1, kinematic=self._kinematic)
+            states.append((memory.history, truth))
+
+    def _asked(self, states: list[tuple[np.ndarray, Window]]) -> Batch:
+        """The model's histories with what is asked of them."""
         own, backs = [], []
-        for flow, truth in self._taken:
-            assert flow.history is not None
-            move, back = wish(flow.history, truth, recipe.return_steps or 1.0)
-            after = flow.history[:, -1:] + move[:, None]
-            own.append(dataclasses.replace(truth, history=flow.history, future=after))
+        for history, truth in states:
+            move, back = wish(history, truth, self._recipe.return_steps or 1.0)
+            after = history[:, -1:] + move[:, None]
+            own.append(dataclasses.replace(truth, history=history, future=after))
             backs.append(back)
-        device = self._ranks.device
-        rng = self._rng(batches.NOISE, step)
-        batch = batches.collate(own, noise_std=0.0, rng=rng, device=device)
-        ways = torch.from_numpy(np.concatenate(backs)).to(device)
-        return dataclasses.replace(batch, back=ways), edges
+        device, rng = self._ranks.device, self._rng(batches.NOISE)
+        batch = batches.collate(own, noise_std=0.0, rng=rng, device=device)  # they have their own
+        return dataclasses.replace(batch, back=torch.from_numpy(np.concatenate(backs)).to(device))
 
     def advanced(self, after: Tensor) -> None:
         """What the model makes of the flows taken: positions [m], shape (N, D)."""
@@ -136,15 +175,32 @@ class Replay:
             history = np.concatenate([flow.history[:, 1:], now[:, None]], axis=1)
             draw = dataclasses.replace(flow.draw, frame=frame)
             flows.append(Rolling(draw, flow.left - 1, history))
+            self._remember(Memory(draw, history))
         self.flows, self._after = flows, None
+
+    def _remember(self, memory: Memory) -> None:
+        room = self._recipe.replay_memory
+        if len(self.memories) < room:
+            self.memories.append(memory)
+        elif room:
+            place = int(self._rng(batches.REMEMBER, self.remembered).integers(room))
+            self.memories[place] = memory
+        self.remembered += 1
 
     # -- files ---------------------------------------------------------------------------------
 
     def save(self, folder: Path, step: int) -> None:
         """Write the flows whole, beside the state of the same step."""
         tensors = {str(k): f.history for k, f in enumerate(self.flows) if f.history is not None}
+        tensors |= {f"memory-{k}": m.history for k, m in enumerate(self.memories)}
         about = [[dataclasses.asdict(f.draw), f.left] for f in self.flows]
-        metadata = {"step": str(step), "drawn": str(self.drawn), "flows": json.dumps(about)}
+        metadata = {
+            "step": str(step),
+            "drawn": str(self.drawn),
+            "flows": json.dumps(about),
+            "remembered": str(self.remembered),
+            "memories": json.dumps([dataclasses.asdict(m.draw) for m in self.memories]),
+        }
         write_whole(folder / self._file, save(tensors, metadata=metadata))
 
     def restore(self, folder: Path, step: int) -> None:
@@ -164,18 +220,22 @@ class Replay:
                 Rolling(Draw(**draw), left, tensors.get(str(k)))
                 for k, (draw, left) in enumerate(json.loads(metadata["flows"]))
             ]
-            drawn = int(metadata["drawn"])
+            memories = [
+                Memory(Draw(**draw), tensors[f"memory-{k}"])
+                for k, draw in enumerate(json.loads(metadata["memories"]))
+            ]
+            drawn, remembered = int(metadata["drawn"]), int(metadata["remembered"])
         except (OSError, SafetensorError, KeyError, TypeError, ValueError):
             return
-        if all(self._known(f) for f in flows):
+        if all(self._known(d) for d in (*(f.draw for f in flows), *(m.draw for m in memories))):
             self.flows, self.drawn = flows[: self._recipe.replay], drawn
+            self.memories, self.remembered = memories[: self._recipe.replay_memory], remembered
 
-    def _known(self, flow: Rolling) -> bool:
-        source = flow.draw.source
-        if source >= len(self._data.sources):
+    def _known(self, draw: Draw) -> bool:
+        if draw.source >= len(self._data.sources):
             return False
-        halved = flow.draw.half and self._data.sources[source].plane is None
-        return not halved and flow.draw.frame < self._data.starts(source, 1)
+        halved = draw.half and self._data.sources[draw.source].plane is None
+        return not halved and draw.frame < self._data.starts(draw.source, 1)
 
     @property
     def _file(self) -> str:

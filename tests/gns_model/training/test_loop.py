@@ -89,10 +89,19 @@ def test_the_best_model_is_kept(tiny, tmp_path):
     [
         {},
         {"replay": 5, "replay_steps": 3, "return_steps": 4, "unroll_fraction": 1.0},
+        {
+            "replay": 5,
+            "replay_steps": 3,
+            "replay_memory": 3,
+            "replay_relative_to": 0.5,
+            "return_steps": 4,
+            "relative_to": 0.1,
+            "unroll_fraction": 1.0,
+        },
         {"flow_share": 0.7, "flow_steps": 4, "flow_edges": 3000, "unroll_fraction": 1.0},
         {"optimiser": "descent", "learning_rate": 0.1},
     ],
-    ids=["windows", "replay", "flows", "descent"],
+    ids=["windows", "replay", "memory", "flows", "descent"],
 )
 def test_resume_is_bit_exact_after_a_signal(tiny, tmp_path, monkeypatch, same_state, options):
     """Six steps at once, and three, SIGTERM, three: the same weights, average and moments."""

@@ -155,6 +155,53 @@ def test_a_file_keeps_the_flows_of_its_step_only(flight, tmp_path):
     assert restored(3).flows == []
 
 
+def remembering(flight, room: int) -> Replay:
+    recipe, data, statistics, _ = flight
+    with session("cpu") as ranks:
+        recipe = recipe.model_copy(update={"replay_memory": room})
+        return Replay(data, recipe, statistics, ranks)
+
+
+def test_states_are_remembered_until_others_take_their_place(flight):
+    replay, net = remembering(flight, 4), flight[3]
+    assert replay.recall(0) is None
+    seen = []
+    for step in range(8):
+        advance(replay, net, step)
+        assert len(replay.memories) == min(4, replay.remembered), "nothing before it is kept"
+        replay.keep()
+        seen += [m for m in replay.memories if not any(m is other for other in seen)]
+    assert replay.remembered > 8
+    assert len(replay.memories) == 4
+    assert len(seen) > 4
+    batch, edges = replay.recall(8)
+    assert edges > 0
+    # A perfect model's states are the truth, which asks them for no way back.
+    after = net.step(batch.history, batch.world)
+    loss = step_error(net, batch.history, after, batch.moves[:, 0], batch=batch.world.batch)
+    assert float(loss) < 1e-4
+    torch.testing.assert_close(batch.back, torch.zeros_like(batch.back), rtol=0, atol=1e-6)
+
+
+def test_a_file_keeps_what_is_remembered(flight, tmp_path):
+    replay, net = remembering(flight, 4), flight[3]
+    for step in range(5):
+        advance(replay, net, step)
+        replay.keep()
+    replay.save(tmp_path, 5)
+    same, smaller = remembering(flight, 4), remembering(flight, 2)
+    for other in (same, smaller):
+        other.restore(tmp_path, 5)
+    assert len(smaller.memories) == 2
+    for step in range(5, 8):  # and both go on alike
+        a, b = replay.recall(step)[0], same.recall(step)[0]
+        torch.testing.assert_close(a.history, b.history, rtol=0, atol=0)
+        torch.testing.assert_close(a.moves, b.moves, rtol=0, atol=0)
+        for one in (replay, same):
+            advance(one, net, step)
+            one.keep()
+
+
 def test_a_recipe_with_fewer_flows_goes_on_with_the_first_of_them(flight, tmp_path):
     replay, net = started(flight), flight[3]
     advance(replay, net, 0)
