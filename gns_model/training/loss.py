@@ -40,12 +40,12 @@ class Emphasis:
         scenes_alike: every scene of the batch counts as much as any other, not as many times as it
             has points: a narrow column is a tenth of a wide one, and its runout as important.
         relative_to: an acceleration q [standard deviations]. Errors are divided by
-            sqrt(s² + q²), s the root mean square of what is asked of the scene. A scene in
+            sqrt(s² + q²), s the root mean square of the scene's accelerations in the history and
+            in the step that the model gives, and of the way back where one is asked for. A scene in
             violent motion has large errors for a few steps, and a slow one small errors for so many
-            that they decide where it stops. Where a way back is a part of what is asked, s² is the
-            sum of the squares of that and of what the model gives: the way back is a draw that no
-            state foretells, and divided by their sum those that cancel the motion would count for
-            more than those that go with it, so that everything would be asked to stand still.
+            that they decide where it stops. What is asked must not be a part of s: it varies by
+            chance about what a state foretells, and divided by itself, the weak draws would count
+            for more than the strong ones, so that every flow would be taught to start too slowly.
     """
 
     linear_beyond: float | None = None
@@ -95,11 +95,10 @@ def step_error(
         back: the part of `move` that leads back to the truth [m], shape (N, D); default: none.
     """
     place, error = history[:, -1], (after - history[:, -1]) - move
-    before = (history[:, -1] - history[:, -2]).detach()
-    if back is None:
-        strength = (move - before).square()
-    else:
-        strength = (after.detach() - place.detach() - before).square() + back.square()
+    velocities = torch.cat([history, after[:, None]], dim=1).detach().diff(dim=1)
+    strength = velocities.diff(dim=1).square().mean(dim=1)
+    if back is not None:
+        strength = strength + back.square()
     if moving is not None:
         place, error, strength = place[moving], error[moving], strength[moving]
         batch = None if batch is None else batch[moving]
