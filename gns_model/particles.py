@@ -55,6 +55,14 @@ def scatter(points: Points, subcells: int, draw: int = 0) -> Points:
     return replace(points, positions=points.positions + points.spacing * offset)
 
 
+def shaken(points: Points, jitter: float, draw: int = 0) -> Points:
+    """Move every point by up to `jitter` spacings along each axis, which leaves it in its own cell
+    up to half of one: another filling of the same releases. The same `draw` moves it likewise."""
+    most = jitter * points.spacing
+    shift = np.random.default_rng(draw).uniform(-most, most, points.positions.shape)
+    return replace(points, positions=points.positions + shift)
+
+
 def fill(scene: Scene, spacing: float) -> Points:
     """Fill the releases of `scene` with points `spacing` [m] apart.
 

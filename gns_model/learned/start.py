@@ -14,7 +14,7 @@ from torch import Tensor
 from gns_model.errors import SimulatorError
 from gns_model.learned.config import ModelConfig
 from gns_model.learned.world import baffle_points, baffle_poses
-from gns_model.particles import MOVING, STATIONARY, Points, fill, scatter
+from gns_model.particles import MOVING, STATIONARY, Points, fill, scatter, shaken
 from gns_model.scene import Scene
 
 #: Share of the spacing by which a perturbed start displaces the points of a lattice.
@@ -103,13 +103,13 @@ def shifted(scene: Scene, spacing: float, subcells: int, filling: int, draw: int
     (`particles.scatter`); one that starts on a lattice has its points shifted by up to
     `PERTURBATION` of the spacing.
     """
-    points = fill(scene, spacing)
+    usual = scatter(fill(scene, spacing), subcells, filling)
     if subcells > 1:
-        usual, other = (scatter(points, subcells, k).positions for k in (filling, filling + draw))
-        shift: np.ndarray = other - usual
-        return shift
-    most = PERTURBATION * spacing if draw else 0.0
-    return np.random.default_rng(draw).uniform(-most, most, points.positions.shape)
+        other = scatter(fill(scene, spacing), subcells, filling + draw)
+    else:
+        other = shaken(usual, PERTURBATION if draw else 0.0, draw)
+    shift: np.ndarray = other.positions - usual.positions
+    return shift
 
 
 def solver_frames(config: ModelConfig, scene: Scene) -> Tensor:

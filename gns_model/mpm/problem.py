@@ -12,7 +12,7 @@ from gns_model.errors import SimulatorError
 from gns_model.mpm.contact import SKIN, solid_nodes
 from gns_model.mpm.material import MaterialConstants, material_constants, wave_speed
 from gns_model.mpm.transfer import PADDING, Lattice
-from gns_model.particles import MOVING, Points, fill
+from gns_model.particles import MOVING, Points, fill, shaken
 from gns_model.scene import Scene
 from gns_model.trajectory import DIVERGED, OK, Trajectory
 
@@ -40,6 +40,9 @@ class Discretisation:
         frame_interval: time between stored frames [s].
         cfl: share of the stable substep that is used.
         damping_rate: see DAMPING_RATE [1/s].
+        jitter: how far the points of the start are moved off their lattice along each axis, in
+            spacings; below a half of one. See `particles.shaken`.
+        filling: which of the many ways to move them.
 
     Raises:
         SimulatorError: if a value makes no sense.
@@ -49,6 +52,8 @@ class Discretisation:
     frame_interval: float = 0.01
     cfl: float = 0.4
     damping_rate: float = DAMPING_RATE
+    jitter: float = 0.0
+    filling: int = 0
 
     def __post_init__(self) -> None:
         require_positive(
@@ -56,6 +61,10 @@ class Discretisation:
         )  # fmt: skip
         if not self.damping_rate >= 0:
             raise SimulatorError(f"damping_rate must not be negative, got {self.damping_rate}")
+        if not 0 <= self.jitter < 0.5:
+            raise SimulatorError(f"jitter must be 0 or more and below 0.5, got {self.jitter}")
+        if self.filling < 0:
+            raise SimulatorError(f"filling must not be negative, got {self.filling}")
 
     def spacing_of(self, scene: Scene) -> float:
         """The spacing that `scene` is solved at [m]."""
@@ -185,7 +194,7 @@ def pose(scene: Scene, chosen: Discretisation) -> Problem:
     substeps = math.ceil(chosen.frame_interval / stable)
     return Problem(
         scene=scene,
-        start=fill(scene, spacing),
+        start=shaken(fill(scene, spacing), chosen.jitter, chosen.filling),
         lattice=lattice,
         lower=lower,
         upper=upper,

@@ -44,6 +44,7 @@ class MpmSimulator:
             uses one; results do not depend on it. Default 1.
         workers: processes that roll out several scenes side by side, one thread each.
         damping_rate: see DAMPING_RATE [1/s].
+        jitter, filling: another start of the same flow, see `Discretisation`.
     """
 
     name = "mpm"
@@ -57,10 +58,13 @@ class MpmSimulator:
         threads: int = 1,
         workers: int = 1,
         damping_rate: float = DAMPING_RATE,
+        jitter: float = 0.0,
+        filling: int = 0,
     ) -> None:
         self.chosen = Discretisation(
-            spacing=spacing, frame_interval=frame_interval, cfl=cfl, damping_rate=damping_rate
-        )
+            spacing=spacing, frame_interval=frame_interval, cfl=cfl, damping_rate=damping_rate,
+            jitter=jitter, filling=filling,
+        )  # fmt: skip
         self.threads = threads
         self.workers = workers
         require_positive(threads=threads, workers=workers)

@@ -34,7 +34,7 @@ class TorchMpmSimulator:
     `torch_transfer`.
 
     Args:
-        spacing, frame_interval, cfl, damping_rate: see `Discretisation`.
+        spacing, frame_interval, cfl, damping_rate, jitter, filling: see `Discretisation`.
         device: "cpu", or "cuda" (one with fast float64, such as an A100 or H100, is best).
         batch: scenes at once. A point takes some 5 KB of device memory in 3D and 2.5 KB in 2D, and
             12 or 8 bytes for every stored frame.
@@ -54,13 +54,16 @@ class TorchMpmSimulator:
         frame_interval: float = 0.01,
         cfl: float = 0.4,
         damping_rate: float = DAMPING_RATE,
+        jitter: float = 0.0,
+        filling: int = 0,
         device: str = "cpu",
         batch: int = 32,
         cuda_graph: bool = False,
     ) -> None:
         self.chosen = Discretisation(
-            spacing=spacing, frame_interval=frame_interval, cfl=cfl, damping_rate=damping_rate
-        )
+            spacing=spacing, frame_interval=frame_interval, cfl=cfl, damping_rate=damping_rate,
+            jitter=jitter, filling=filling,
+        )  # fmt: skip
         require_positive(batch=batch)
         self.batch = batch
         self.device = _device(device)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from gns_model.errors import SceneError
 from gns_model.paper import flume_scene
-from gns_model.particles import fill, scatter
+from gns_model.particles import fill, scatter, shaken
 from gns_model.scene import Scene
 
 
@@ -103,3 +103,14 @@ def test_scattered_points_stay_in_their_cells_and_keep_their_mean(subcells):
     assert len(np.unique(offset.round(9))) == subcells
     np.testing.assert_allclose(offset.mean(axis=0), 0, atol=0.02)
     np.testing.assert_array_equal(moved.positions, scatter(regular, subcells).positions)
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.25, 0.49])
+def test_shaken_points_stay_in_their_cells_and_differ_by_draw(jitter):
+    regular = fill(flume_scene(), 0.03125)
+    moved = shaken(regular, jitter, 1)
+    offset = np.abs(moved.positions - regular.positions).max(axis=0) / regular.spacing
+    assert (offset <= jitter + 1e-9).all()
+    assert (offset >= 0.95 * jitter).all()
+    np.testing.assert_array_equal(moved.positions, shaken(regular, jitter, 1).positions)
+    assert (jitter == 0) == np.array_equal(moved.positions, shaken(regular, jitter, 2).positions)

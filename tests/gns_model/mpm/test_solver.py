@@ -239,7 +239,26 @@ def test_progress_reaches_one_and_an_interrupt_passes_through():
         MpmSimulator(spacing=0.1).rollout([scene(duration=0.05)], progress=interrupt)
 
 
-@pytest.mark.parametrize("bad", [{"spacing": 0.0}, {"cfl": -1.0}, {"workers": 0}])
+def test_another_filling_starts_elsewhere_and_flows_alike():
+    column = scene(duration=0.2)
+    usual, shaken, other = (
+        MpmSimulator(spacing=0.05, jitter=jitter, filling=filling).rollout([column])[0]
+        for jitter, filling in [(0.0, 0), (0.25, 0), (0.25, 1)]
+    )
+    for trajectory in (shaken, other):
+        moved = np.abs(trajectory.positions[0] - usual.positions[0])
+        assert 0.01 < moved.max() <= 0.0125 + 1e-6
+        assert trajectory.status == "ok"
+        assert trajectory.settings["jitter"] == 0.25
+    assert not np.array_equal(shaken.positions[0], other.positions[0])
+    centroids = [t.positions[-1].mean(axis=0) for t in (usual, shaken, other)]
+    np.testing.assert_allclose(centroids[1:], centroids[:1] * 2, atol=0.005)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [{"spacing": 0.0}, {"cfl": -1.0}, {"workers": 0}, {"jitter": 0.5}, {"filling": -1}],
+)
 def test_options_that_make_no_sense_are_refused(bad):
     with pytest.raises(SimulatorError, match=next(iter(bad))):
         MpmSimulator(**bad)

@@ -129,6 +129,14 @@ def test_the_scenes_rub_on_every_boundary(scene, boundary):
     assert np.abs(rough.positions[-1] - smooth.positions[-1]).max() > 1e-3
 
 
+def test_starts_from_the_filling_that_numba_starts_from():
+    chosen = {"spacing": SPACING[2], "jitter": 0.3, "filling": 4}
+    [ours] = TorchMpmSimulator(**chosen).rollout([COLUMN])
+    [theirs] = MpmSimulator(**chosen).rollout([COLUMN])
+    np.testing.assert_allclose(ours.positions, theirs.positions, atol=1e-6)
+    assert not np.array_equal(ours.positions[0], posed(COLUMN).start.positions)
+
+
 @pytest.mark.parametrize("scenes", [(COLUMN, FLYING), (BLOCK, TOSSED, draw("flume", 4, 3))])
 def test_a_batch_is_its_scenes_alone(scenes):
     problems = [posed(s) for s in scenes]
