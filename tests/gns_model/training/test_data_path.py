@@ -344,6 +344,48 @@ def test_an_error_of_the_front_weighs_more(free_flight):
     assert cost(order[:count], 8.0) == pytest.approx(share + 8 / 2, rel=1e-2)
 
 
+def test_an_error_that_strains_weighs_more(free_flight):
+    """One that all points share strains nothing; one that grows with x does, and hardly any more
+    when the same values are dealt out at random."""
+    net, batch = ballistic(free_flight)
+    history, move = batch.history, batch.moves[:, 0]
+    scale = DT**2 * net.acceleration_std
+    x = history[:, -1, 0]
+    values = (x - x.mean()) / x.std(correction=0)
+
+    def cost(values, weight):
+        error = torch.zeros_like(move)
+        error[:, 0] = values
+        after = history[:, -1] + move + error * scale
+        return float(step_error(net, history, after, move, Emphasis(strain_weight=weight)))
+
+    plain = 1 / move.shape[1]
+    assert cost(values, 0.0) == pytest.approx(plain, rel=1e-2)
+    assert cost(torch.ones_like(values), 8.0) == pytest.approx(plain, rel=1e-2)
+    assert cost(values, 8.0) > 8.9 * plain
+    shuffled = values[torch.randperm(len(values), generator=torch.Generator().manual_seed(0))]
+    assert cost(shuffled, 8.0) < 2 * plain
+
+
+def test_neighbours_that_close_in_weigh_more(free_flight):
+    """Cells that shrink, each about its middle, in a scene that keeps its size as a whole."""
+    net, batch = ballistic(free_flight)
+    side = torch.arange(4 * CELL) + 0.5
+    place = torch.cartesian_prod(side, side, side)
+    off = place.remainder(CELL) - CELL / 2
+    history = (SPACING * place)[:, None].repeat(1, batch.history.shape[1], 1)
+    still = torch.zeros_like(place)
+
+    def cost(error, weight):
+        after = history[:, -1] + error / error.square().mean().sqrt() * DT**2 * net.acceleration_std
+        return float(step_error(net, history, after, still, Emphasis(strain_weight=weight)))
+
+    assert cost(-off, 0.0) == pytest.approx(1, rel=1e-3)
+    # A sixteenth of it is seen as a strain of the whole scene: cells are a quarter of its width.
+    assert cost(-off, 8.0) == pytest.approx(1 + 8 * (1 + 1 / 16), rel=0.02)
+    assert cost(off.roll(1, 1), 8.0) == pytest.approx(1 + 8 / 16, rel=0.05)  # a shear: nothing else
+
+
 def test_a_small_scene_can_count_as_much_as_a_large_one(free_flight):
     net, batch = ballistic(free_flight)
     count = len(batch.history)
