@@ -162,6 +162,10 @@ class ModelConfig(BaseModel):
     #: Push points out of the boxes and into the domain after every step.
     project: bool = True
 
+    #: Push points apart after every step where they are denser than this many times their lattice;
+    #: 0: nowhere, as in the paper. See `crowding.spread`.
+    crowding_limit: NonNegative = 0.0
+
     #: First steps of a rollout that the reference solver takes. A column that was just let go is a
     #: perfect lattice at rest: how it will start follows from faces that lie many neighbours away,
     #: while one step later velocities tell. The paper's rollouts begin with six frames of its MPM.
@@ -184,6 +188,10 @@ class ModelConfig(BaseModel):
             raise ValueError('baffles = "points" needs types > 0 to tell them from moving points')
         if self.solver_steps and self.subcells > 1:
             raise ValueError("solver_steps needs the solver's own points: subcells = 1")
+        if 0 < self.crowding_limit <= 1:
+            raise ValueError(
+                f"crowding_limit must exceed 1, the density of a release, got {self.crowding_limit:g}"
+            )
         if self.strain_unit and not self.relative_velocity:
             raise ValueError("strain_unit needs relative_velocity = true")
         if self.radius <= self.spacing:

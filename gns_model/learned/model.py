@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from gns_model.learned import features
 from gns_model.learned.config import ModelConfig
 from gns_model.learned.contact import project
+from gns_model.learned.crowding import spread
 from gns_model.learned.graph import radius_graph
 from gns_model.learned.network import EncodeProcessDecode
 from gns_model.learned.world import MATERIAL_FEATURES, World
@@ -150,7 +151,8 @@ class LearnedModel(nn.Module):
         return torch.cat(parts, dim=1)
 
     def predict(self, history: Tensor, world: World) -> Tensor:
-        """Positions one stride later [m], shape (N, D): semi-implicit Euler, then contact.
+        """Positions one stride later [m], shape (N, D): semi-implicit Euler, then contact, of
+        grains with walls and baffles and, where there is a limit, with each other.
 
         v' = v + a dt, p' = p + v' dt, of kinematic points too.
         """
@@ -161,7 +163,12 @@ class LearnedModel(nn.Module):
             acceleration = acceleration + world.point_gravity
         before, now = history[:, -2], history[:, -1]
         after = now + ((now - before) + acceleration * config.dt**2)
-        return project(now, after, world) if config.project else after
+        if config.project:
+            after = project(now, after, world)
+        if config.crowding_limit:
+            spaced = spread(after, world, config.spacing, config.crowding_limit)
+            after = project(after, spaced, world) if config.project else spaced
+        return after
 
     def step(self, history: Tensor, world: World) -> Tensor:
         """`predict`, but kinematic points stay where they are."""
