@@ -132,6 +132,10 @@ class ModelConfig(BaseModel):
     hidden: Annotated[int, Field(ge=1)] | None = None  #: width of hidden layers; default: latent
     hidden_layers: Annotated[int, Field(ge=1)] = 2  #: of every MLP
     blocks: Annotated[int, Field(ge=1)] = 5  #: message-passing blocks, own weights each
+    #: Rounds of messages between the nodes of a grid that the vertices' latents go down to and
+    #: come back from, halfway through the blocks; 0: none, as in the paper. See `coarse`.
+    coarse_blocks: Annotated[int, Field(ge=0)] = 0
+    coarse_cells: Annotated[int, Field(ge=2)] = 4  #: width of a cell of that grid [spacings]
     activation: Literal["silu", "relu"] = "silu"
     #: How an edge goes on to the next block: "residual": plus its message. "doubled": times two,
     #: a fault of geoelements/gns before December 2024 that weights of that time were trained with.
@@ -190,7 +194,8 @@ class ModelConfig(BaseModel):
             raise ValueError("solver_steps needs the solver's own points: subcells = 1")
         if 0 < self.crowding_limit <= 1:
             raise ValueError(
-                f"crowding_limit must exceed 1, the density of a release, got {self.crowding_limit:g}"
+                "crowding_limit must exceed 1, the density of a release, "
+                f"got {self.crowding_limit:g}"
             )
         if self.strain_unit and not self.relative_velocity:
             raise ValueError("strain_unit needs relative_velocity = true")

@@ -34,10 +34,11 @@ SOFT = 0.05
 def density(positions: Tensor, world: World, spacing: float) -> Tensor:
     """How dense points lie around each, relative to a lattice of `spacing`, shape (N,).
 
-        n_i = sum_j W(|x_i - x_j| / h) / (the same of a lattice),  W(q) = (1 - q²)³,  h = REACH spacing,
+        n_i = sum_j W(|x_i - x_j| / h) / (the same of a lattice),  W(q) = (1 - q²)³,
 
-    over all j, i itself included, and over their images behind the walls near i, or a grain on the
-    base would count as lonely. Images are those of one wall each, which leaves out corners.
+    with h = REACH spacings, over all j, i itself included, and over their images behind the walls
+    near i, or a grain on the base would count as lonely. Images are those of one wall each, which
+    leaves out corners.
 
     Args:
         positions: [m], shape (N, D).

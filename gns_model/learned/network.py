@@ -9,6 +9,7 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
+from gns_model.learned.coarse import CoarseLevel, Grid
 from gns_model.learned.edge_kernel import edge_mlp
 
 ACTIVATIONS = {"silu": nn.functional.silu, "relu": nn.functional.relu}
@@ -131,6 +132,7 @@ class EncodeProcessDecode(nn.Module):
         activation: str,
         hidden: int | None = None,
         edge_update: str = "residual",
+        coarse_blocks: int = 0,
     ) -> None:
         super().__init__()
         mlp = partial(
@@ -141,6 +143,11 @@ class EncodeProcessDecode(nn.Module):
         self.encode_edge = mlp(edge_inputs, latent)
         self.blocks = nn.ModuleList(Block(latent, mlp, doubled=doubled) for _ in range(blocks))
         self.decode = mlp(latent, outputs, norm=False)
+        self.coarse = (
+            CoarseLevel(latent, outputs, coarse_blocks, mlp, partial(Block, latent, mlp))
+            if coarse_blocks
+            else None
+        )
 
     def forward(
         self,
@@ -149,8 +156,11 @@ class EncodeProcessDecode(nn.Module):
         senders: Tensor,
         receivers: Tensor,
         envelope: Tensor | None = None,
+        grid: Grid | None = None,
     ) -> Tensor:
         """(N, vertex_inputs), (E, edge_inputs), (E,), (E,), (E, 1) -> (N, outputs).
+
+        With a coarse level it needs the `grid` under the vertices.
 
         Under `torch.autocast` only the products over edges take its dtype: they are nearly all of
         the work, while the few vertices keep their precision from block to block.
@@ -162,6 +172,8 @@ class EncodeProcessDecode(nn.Module):
             first = self.encode_edge.layers[0].weight
             vertex = self.encode_vertex(vertex)
             edge, _ = self.encode_edge.over_edges(edge, senders, receivers, dtype, first)
-            for block in self.blocks:
+            for k, block in enumerate(self.blocks):
+                if self.coarse is not None and grid is not None and k == len(self.blocks) // 2:
+                    vertex = self.coarse(vertex, grid, dtype)
                 vertex, edge = block(vertex, edge, senders, receivers, envelope, dtype)
             return self.decode(vertex)
