@@ -173,7 +173,8 @@ class EncodeProcessDecode(nn.Module):
             vertex = self.encode_vertex(vertex)
             edge, _ = self.encode_edge.over_edges(edge, senders, receivers, dtype, first)
             for k, block in enumerate(self.blocks):
-                if self.coarse is not None and grid is not None and k == len(self.blocks) // 2:
+                if self.coarse is not None and k == len(self.blocks) // 2:
+                    assert grid is not None
                     vertex = self.coarse(vertex, grid, dtype)
                 vertex, edge = block(vertex, edge, senders, receivers, envelope, dtype)
             return self.decode(vertex)
