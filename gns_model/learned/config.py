@@ -132,10 +132,6 @@ class ModelConfig(BaseModel):
     hidden: Annotated[int, Field(ge=1)] | None = None  #: width of hidden layers; default: latent
     hidden_layers: Annotated[int, Field(ge=1)] = 2  #: of every MLP
     blocks: Annotated[int, Field(ge=1)] = 5  #: message-passing blocks, own weights each
-    #: Rounds of messages between the nodes of a grid that the vertices' latents go down to and
-    #: come back from, halfway through the blocks; 0: none, as in the paper. See `coarse`.
-    coarse_blocks: Annotated[int, Field(ge=0)] = 0
-    coarse_cells: Annotated[int, Field(ge=2)] = 4  #: width of a cell of that grid [spacings]
     activation: Literal["silu", "relu"] = "silu"
     #: How an edge goes on to the next block: "residual": plus its message. "doubled": times two,
     #: a fault of geoelements/gns before December 2024 that weights of that time were trained with.

@@ -6,7 +6,6 @@ import torch
 from torch import Tensor, nn
 
 from gns_model.learned import features
-from gns_model.learned.coarse import Grid
 from gns_model.learned.config import ModelConfig
 from gns_model.learned.contact import project
 from gns_model.learned.crowding import spread
@@ -44,7 +43,6 @@ class LearnedModel(nn.Module):
             blocks=config.blocks,
             activation=config.activation,
             edge_update=config.edge_update,
-            coarse_blocks=config.coarse_blocks,
         )
         for name in ("velocity", "acceleration"):
             self.register_buffer(f"{name}_mean", torch.zeros(config.dim))
@@ -100,12 +98,7 @@ class LearnedModel(nn.Module):
         vertex = self._vertex_features(
             positions, velocities[:, -1], normalised, world, senders, receivers
         )
-        grid = None
-        if config.coarse_blocks:
-            size = config.coarse_cells * config.spacing
-            at = positions, world.point_lower, world.batch
-            grid = Grid.of(*at, size=size, spacing=config.spacing)
-        return self.network(vertex, edge, senders, receivers, weight, grid)
+        return self.network(vertex, edge, senders, receivers, weight)
 
     def _vertex_features(
         self,

@@ -9,7 +9,6 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from gns_model.learned.coarse import CoarseLevel, Grid
 from gns_model.learned.edge_kernel import edge_mlp
 
 ACTIVATIONS = {"silu": nn.functional.silu, "relu": nn.functional.relu}
@@ -132,7 +131,6 @@ class EncodeProcessDecode(nn.Module):
         activation: str,
         hidden: int | None = None,
         edge_update: str = "residual",
-        coarse_blocks: int = 0,
     ) -> None:
         super().__init__()
         mlp = partial(
@@ -143,11 +141,6 @@ class EncodeProcessDecode(nn.Module):
         self.encode_edge = mlp(edge_inputs, latent)
         self.blocks = nn.ModuleList(Block(latent, mlp, doubled=doubled) for _ in range(blocks))
         self.decode = mlp(latent, outputs, norm=False)
-        self.coarse = (
-            CoarseLevel(latent, outputs, coarse_blocks, mlp, partial(Block, latent, mlp))
-            if coarse_blocks
-            else None
-        )
 
     def forward(
         self,
@@ -156,11 +149,8 @@ class EncodeProcessDecode(nn.Module):
         senders: Tensor,
         receivers: Tensor,
         envelope: Tensor | None = None,
-        grid: Grid | None = None,
     ) -> Tensor:
         """(N, vertex_inputs), (E, edge_inputs), (E,), (E,), (E, 1) -> (N, outputs).
-
-        With a coarse level it needs the `grid` under the vertices.
 
         Under `torch.autocast` only the products over edges take its dtype: they are nearly all of
         the work, while the few vertices keep their precision from block to block.
@@ -172,9 +162,6 @@ class EncodeProcessDecode(nn.Module):
             first = self.encode_edge.layers[0].weight
             vertex = self.encode_vertex(vertex)
             edge, _ = self.encode_edge.over_edges(edge, senders, receivers, dtype, first)
-            for k, block in enumerate(self.blocks):
-                if self.coarse is not None and k == len(self.blocks) // 2:
-                    assert grid is not None
-                    vertex = self.coarse(vertex, grid, dtype)
+            for block in self.blocks:
                 vertex, edge = block(vertex, edge, senders, receivers, envelope, dtype)
             return self.decode(vertex)

@@ -14,7 +14,6 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from gns_model.learned.coarse import Grid
 from gns_model.learned.model import LearnedModel
 from gns_model.learned.network import Block, EncodeProcessDecode
 
@@ -22,8 +21,7 @@ from gns_model.learned.network import Block, EncodeProcessDecode
 class PlainNetwork(nn.Module):
     """`EncodeProcessDecode` without the split first layer, the tiles or a short dtype.
 
-    It holds the very parameters of `network`. A coarse level, which others do not have and which
-    hardly takes time, is as it is.
+    It holds the very parameters of `network`.
     """
 
     def __init__(self, network: EncodeProcessDecode) -> None:
@@ -37,15 +35,11 @@ class PlainNetwork(nn.Module):
         senders: Tensor,
         receivers: Tensor,
         envelope: Tensor | None = None,
-        grid: Grid | None = None,
     ) -> Tensor:
         """As `EncodeProcessDecode.forward`, which see."""
         net = self.network
         vertex, edge = net.encode_vertex(vertex), net.encode_edge(edge)
-        for k, block in enumerate(cast(Iterable[Block], net.blocks)):
-            if net.coarse is not None and k == len(net.blocks) // 2:
-                assert grid is not None
-                vertex = net.coarse(vertex, grid, edge.dtype)
+        for block in cast(Iterable[Block], net.blocks):
             message = block.edge(torch.cat([vertex[receivers], vertex[senders], edge], dim=1))
             weighted = message if envelope is None else message * envelope
             total = torch.zeros_like(vertex).index_add(0, receivers, weighted)

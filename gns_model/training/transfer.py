@@ -21,10 +21,10 @@ from gns_model.learned.model import LearnedModel
 from gns_model.training.recipe import RecipeError
 
 #: What may differ between the two configurations: the weights do not depend on it, or, for the
-#: last four, `inherit` makes room.
+#: last three, `inherit` makes room.
 FREE = {
     "noise_std", "subcells", "limits", "bounds", "solver_steps", "crowding_limit",
-    "material_features", "depth_range", "strain_unit", "coarse_blocks",
+    "material_features", "depth_range", "strain_unit",
 }  # fmt: skip
 
 #: What is as long as the scale. What strain and depth are measured in does not grow with it.
@@ -40,10 +40,9 @@ _FIRST = "network.encode_{}.layers.0.weight"
 def inherit(model: LearnedModel, start_from: str) -> None:
     """Copy weights and normalisation of the model `start_from` into `model`, in place.
 
-    Material, depth and strain features that only `model` has get weights of zero, and a coarse
-    level that only `model` has begins with those: it ignores them at first, and moves points
-    exactly as its parent does, or, if its lengths are λ times the parent's, as the parent does a
-    flow of that scale. A `crowding_limit` of its own acts at once.
+    Material, depth and strain features that only `model` has get weights of zero: it begins by
+    ignoring them, and moves points exactly as its parent does, or, if its lengths are λ times the
+    parent's, as the parent does a flow of that scale. A `crowding_limit` of its own acts at once.
 
     Args:
         start_from: a shipped model or a checkpoint folder.
@@ -73,9 +72,6 @@ def inherit(model: LearnedModel, start_from: str) -> None:
             state[_FIRST.format(what)] = torch.stack(
                 [columns.get(name, torch.zeros_like(weight[:, 0])) for name in own], dim=1
             )
-    if mine.coarse_blocks and not theirs.coarse_blocks:
-        fresh = model.state_dict().items()
-        state |= {name: value for name, value in fresh if name.startswith("network.coarse.")}
     model.load_state_dict(state)
 
 
@@ -146,11 +142,6 @@ def _check(mine: ModelConfig, theirs: ModelConfig, name: str, *, similar: bool) 
         raise RecipeError(
             f"start_from = {name!r}: its strain_unit is {theirs.strain_unit:g}, the recipe's "
             f"{mine.strain_unit:g}"
-        )
-    if theirs.coarse_blocks and mine.coarse_blocks != theirs.coarse_blocks:
-        raise RecipeError(
-            f"start_from = {name!r}: its coarse_blocks is {theirs.coarse_blocks}, the recipe's "
-            f"{mine.coarse_blocks}"
         )
     dropped = set(theirs.material_features) - set(mine.material_features)
     if dropped:

@@ -31,7 +31,7 @@ MODELS = {
     "depth and material": {"depth_range": 0.1, "material_features": ("tan_friction_angle",)},
     "strain": {"strain_unit": 0.3},
     "solver first": {"solver_steps": 2},
-    "coarse level, crowding": {"coarse_blocks": 2, "crowding_limit": 1.2},
+    "crowding": {"crowding_limit": 1.2},
 }
 
 

@@ -41,8 +41,6 @@ def make_model() -> MakeModel:
             acceleration_mean=torch.zeros(dim),
             acceleration_std=torch.full((dim,), 4.0),
         )
-        if model.network.coarse is not None:  # or it would add nothing
-            torch.nn.init.normal_(model.network.coarse.lift.weight, std=0.3)
         return model.to(dtype)
 
     return make

@@ -9,14 +9,9 @@ from gns_model.learned.world import baffle_boxes, baffle_points
 from gns_model.particles import MOVING, STATIONARY, fill
 
 DIMS = pytest.mark.parametrize("dim", [2, 3])
-#: What vertices and edges may see beside the paper's features, and what else a step may consist of.
+#: What vertices and edges may see beside the paper's features, and what else a step may do.
 MORE = pytest.mark.parametrize(
-    "more",
-    [
-        {},
-        {"depth_range": 0.1, "strain_unit": 0.3},
-        {"coarse_blocks": 2, "coarse_cells": 2, "crowding_limit": 1.1},
-    ],
+    "more", [{}, {"depth_range": 0.1, "strain_unit": 0.3}, {"crowding_limit": 1.1}]
 )
 
 

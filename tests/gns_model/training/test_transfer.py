@@ -82,30 +82,6 @@ def test_new_features_change_nothing_at_first(tmp_path, slides, types, more, new
     assert (first.grad[:, begin : begin + new].abs().sum(0) > 0).all()
 
 
-def test_a_coarse_level_adds_nothing_at_first_and_is_kept(tmp_path, slides):
-    given = batch(slides)
-    model = build()
-    child = build(seed=1, coarse_blocks=2)
-    inherit(child, str(save_model(tmp_path / "parent", model)))
-    with torch.no_grad():
-        before = model.step(given.history, given.world)
-        after = child.step(given.history, given.world)
-    torch.testing.assert_close(after, before, rtol=0, atol=1e-7)
-    lift = child.network.coarse.lift
-    child.acceleration(given.history, given.world).square().mean().backward()
-    assert float(lift.weight.grad.abs().sum()) > 0
-
-    torch.nn.init.normal_(lift.weight)
-    grandchild = build(seed=2, coarse_blocks=2)
-    inherit(grandchild, str(save_model(tmp_path / "child", child)))
-    with torch.no_grad():
-        other = grandchild.step(given.history, given.world)
-        torch.testing.assert_close(other, child.step(given.history, given.world))
-    assert not torch.allclose(other, before)
-    with pytest.raises(RecipeError, match="its coarse_blocks is 2, the recipe's 0"):
-        inherit(build(), str(tmp_path / "child"))
-
-
 def test_features_that_the_parent_knows_keep_their_weights_in_any_order(tmp_path, slides):
     given = batch(slides)
     model = build(material_features=("tan_friction_angle",))
