@@ -122,14 +122,14 @@ def test_scenes_do_not_see_each_other_and_kinematic_points_stay():
 @pytest.mark.parametrize("dim", [2, 3])
 def test_derivatives_are_those_of_differences(dim):
     points = heap(dim, 3) - lattice(dim).min() + 0.3 * SPACING  # near walls, too
-    world, direction = world_of(len(points), dim), torch.randn(len(points), dim).double()
+    world, rng = world_of(len(points), dim), np.random.default_rng(0)
+    direction = torch.tensor(rng.normal(size=points.shape))
 
     def value(positions):
         return (spread(positions, world, SPACING, 1.2) * direction).sum()
 
     leaf = points.clone().requires_grad_()
     [found] = torch.autograd.grad(value(leaf), leaf)
-    rng = np.random.default_rng(0)
     for _ in range(5):
         way = torch.tensor(rng.normal(size=points.shape))
         h = 1e-6 * SPACING
