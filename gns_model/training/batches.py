@@ -19,7 +19,7 @@ from gns_model.learned.world import World
 from gns_model.particles import STATIONARY
 from gns_model.training.augment import mirror_positions, mirrored
 from gns_model.training.kinematic import with_baffle_points
-from gns_model.training.noise import random_walk
+from gns_model.training.noise import random_walk, shared_acceleration
 from gns_model.training.statistics import Statistics
 
 #: Purposes of random generators.
@@ -153,8 +153,10 @@ def collate(
     noise_std: float,
     rng: np.random.Generator,
     device: torch.device,
+    spacing: float = 0.0,
+    acceleration_noise: float = 0.0,
 ) -> Batch:
-    """Lay windows side by side and add random-walk noise to the history of what moves.
+    """Lay windows side by side and add noise (`noise`) to the history of what moves.
 
     The true displacements are taken between true positions, so that adding one to a noisy position
     corrects the target for the noise: a step that reproduces it ends with the true velocity.
@@ -165,6 +167,9 @@ def collate(
     friction = np.concatenate([w.tan_friction for w in windows])
     moves = np.diff(future, axis=1, prepend=history[:, -1:])
     moving = kinds != STATIONARY
+    if acceleration_noise > 0:
+        shared = [shared_acceleration(rng, w.history, spacing, acceleration_noise) for w in windows]
+        history = history + np.concatenate(shared) * moving[:, None, None]
     if noise_std > 0:
         points, frames, dim = history.shape
         noise = random_walk(rng, points, frames - 1, dim, noise_std)

@@ -292,6 +292,8 @@ def _forward_and_backward(
             noise_std=model.config.noise_std,
             rng=batches.generator(recipe.seed, batches.NOISE, step, ranks.rank),
             device=ranks.device,
+            spacing=model.config.spacing,
+            acceleration_noise=recipe.acceleration_noise,
         )
         with context:
             loss = unrolled_loss(

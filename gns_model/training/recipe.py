@@ -77,6 +77,9 @@ class Recipe(BaseModel):
     early_steps: Count = 8  #: 0.16 s at a stride of 0.02 s: a release turns into a flow
     clip_norm: Positive = 1.0  #: of the whole gradient
     ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.999
+    #: Smooth noise on the accelerations of the history, as a share of them; see `noise`. With it a
+    #: model must tell from the state what drives it, and does not repeat what it did last.
+    acceleration_noise: NonNegative = 0.0
     mirror: bool = True  #: show every other window in a mirror (`augment`)
     #: Show every other window of a symmetric 2D flow as half of it against a wall (`data.halves`).
     halves: bool = False
@@ -122,6 +125,11 @@ class Recipe(BaseModel):
         if self.replay and self.return_steps is None:
             raise ValueError(
                 "replay needs return_steps: how fast a flow is asked back to the truth"
+            )
+        if self.acceleration_noise and self.model.history < 2:
+            raise ValueError(
+                "acceleration_noise needs model.history of at least 2: one velocity tells no "
+                "acceleration"
             )
         if 0 < self.model.types <= MOVING:
             raise ValueError(

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from gns_model.errors import GnsError
 from gns_model.training import Recipe
-from gns_model.training.noise import random_walk
+from gns_model.training.noise import SHORTEST, random_walk, shared_acceleration
 from gns_model.training.schedule import MovingAverage, learning_rate
 
 
@@ -24,6 +25,63 @@ def test_velocity_noise_is_a_random_walk_that_ends_at_its_std(history):
     wanted = std * np.sqrt(np.arange(1, history + 1) / history)
     np.testing.assert_allclose(velocity.std(axis=(0, 2)), wanted, rtol=0.02)
     np.testing.assert_allclose(velocity.mean(axis=(0, 2)), 0, atol=0.02 * std)
+
+
+SPACING = 0.01
+
+
+def falling(points=400, history=5, dim=2, seed=0):
+    """Positions whose accelerations are 1e-3 m a step², by root mean square over the axes."""
+    rng = np.random.default_rng(seed)
+    place = rng.uniform(0, 0.5, (points, 1, dim)) + np.zeros((1, history + 1, 1))
+    time = np.arange(history + 1)[None, :, None]
+    down = np.zeros(dim)
+    down[1] = -1e-3 * np.sqrt(dim)
+    return place + 0.5 * time**2 * down
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_shared_acceleration_keeps_the_last_velocity_and_is_the_same_at_all_times(dim):
+    history = falling(dim=dim)
+    noise = shared_acceleration(np.random.default_rng(1), history, SPACING, 0.5)
+    assert noise.shape == history.shape
+    assert noise.dtype == np.float32
+    assert not noise[:, -2:].any()
+    added = np.diff(noise.astype(np.float64), n=2, axis=1)
+    assert np.abs(added).max() > 1e-4
+    np.testing.assert_allclose(added, added[:, -1:].repeat(added.shape[1], 1), atol=1e-9)
+
+
+def test_shared_acceleration_has_the_share_that_it_is_told_to():
+    history = falling(points=100)
+    added = [
+        np.diff(shared_acceleration(np.random.default_rng(k), history, SPACING, 0.5), 2, axis=1)
+        for k in range(1000)
+    ]
+    assert np.sqrt(np.mean(np.square(added))) == pytest.approx(0.5 * 1e-3, rel=0.05)
+    assert np.abs(np.mean(added)) < 0.05 * 1e-3
+
+
+def test_neighbours_share_it():
+    """Over a tenth of the shortest wave no wave turns by more than 0.63; noise of every point by
+    itself would differ by 1.4 times its own root mean square."""
+    history = falling(points=50)
+    both = np.concatenate([history, history + np.array([0.1 * SHORTEST * SPACING, 0.0])])
+    for k in range(20):
+        noise = shared_acceleration(np.random.default_rng(k), both, SPACING, 0.5)[:, 0]
+        apart = noise[:50] - noise[50:]
+        assert 0 < np.mean(apart**2) < 0.63**2 * np.mean(noise**2)
+
+
+def test_a_scene_at_rest_gets_no_shared_acceleration():
+    still = np.repeat(np.random.default_rng(0).uniform(0, 1, (30, 1, 2)), 6, axis=1)
+    assert not shared_acceleration(np.random.default_rng(1), still, SPACING, 0.5).any()
+
+
+def test_a_single_velocity_has_no_acceleration_to_hide(tiny):
+    values = {**tiny, "acceleration_noise": 0.5, "model": {**tiny["model"], "history": 1}}
+    with pytest.raises(GnsError, match=r"acceleration_noise needs model\.history of at least 2"):
+        Recipe.from_dict(values)
 
 
 def test_cosine_warms_up_and_ends_at_zero(tiny):
