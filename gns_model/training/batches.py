@@ -49,6 +49,8 @@ class Batch:
         moving: mask of the points that the loss is about, shape (N,); None: all.
         back: the part of the first move that leads drifted points back to the truth [m], shape
             (N, D); None: no move has one.
+        shared: the part of `history` that is noise shared by neighbours, shape (N, H+1, D); None:
+            it has none.
     """
 
     history: Tensor
@@ -56,6 +58,7 @@ class Batch:
     world: World
     moving: Tensor | None = None
     back: Tensor | None = None
+    shared: Tensor | None = None
 
 
 def generator(seed: int, purpose: int, step: int, rank: int = 0) -> np.random.Generator:
@@ -167,9 +170,11 @@ def collate(
     friction = np.concatenate([w.tan_friction for w in windows])
     moves = np.diff(future, axis=1, prepend=history[:, -1:])
     moving = kinds != STATIONARY
+    shared = None
     if acceleration_noise > 0:
-        shared = [shared_acceleration(rng, w.history, spacing, acceleration_noise) for w in windows]
-        history = history + np.concatenate(shared) * moving[:, None, None]
+        each = [shared_acceleration(rng, w.history, spacing, acceleration_noise) for w in windows]
+        shared = np.concatenate(each) * moving[:, None, None]
+        history = history + shared
     if noise_std > 0:
         points, frames, dim = history.shape
         noise = random_walk(rng, points, frames - 1, dim, noise_std)
@@ -186,4 +191,5 @@ def collate(
         torch.from_numpy(moves).to(device),
         world,
         None if moving.all() else torch.from_numpy(moving).to(device),
+        shared=None if shared is None else torch.from_numpy(shared).to(device),
     )

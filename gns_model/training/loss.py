@@ -83,6 +83,7 @@ def step_error(
     batch: Tensor | None = None,
     moving: Tensor | None = None,
     back: Tensor | None = None,
+    shared: Tensor | None = None,
 ) -> Tensor:
     """Mean square of the normalised acceleration error, a scalar.
 
@@ -98,9 +99,12 @@ def step_error(
         batch: scene of every point, shape (N,); default: all in one.
         moving: mask of the points that count, shape (N,); default: all.
         back: the part of `move` that leads back to the truth [m], shape (N, D); default: none.
+        shared: noise in `history` that is no part of s, shape (N, H+1, D); default: none. It would
+            weigh most where it cancels what moves the scene, and teach the model to overdo that.
     """
     place, error = history[:, -1], (after - history[:, -1]) - move
-    velocities = torch.cat([history, after[:, None]], dim=1).detach().diff(dim=1)
+    clean = history if shared is None else history - shared
+    velocities = torch.cat([clean, after[:, None]], dim=1).detach().diff(dim=1)
     strength = velocities.diff(dim=1).square().mean(dim=1)
     if back is not None:
         strength = strength + back.square()
@@ -221,6 +225,8 @@ def unrolled_loss(
             the model learns to push back.
     """
 
+    shared = batch.shared
+
     def error(after: Tensor, move: Tensor, back: Tensor | None = None) -> Tensor:
         return step_error(
             model,
@@ -231,6 +237,7 @@ def unrolled_loss(
             batch=batch.world.batch,
             moving=batch.moving,
             back=back,
+            shared=shared,
         )
 
     history = batch.history
@@ -238,7 +245,7 @@ def unrolled_loss(
         with torch.no_grad():
             for _ in range(steps - 1):
                 after = model.step(history, batch.world)
-                history = torch.cat([history[:, 1:], after[:, None]], dim=1)
+                history, shared = _onwards(history, after), _aged(shared)
         move, back = batch.moves[:, steps - 1], batch.back
         if return_steps is not None and steps > 1:
             truth = batch.history[:, -1] + batch.moves[:, : steps - 1].sum(1)
@@ -249,5 +256,15 @@ def unrolled_loss(
     for k in range(steps):
         after = model.step(history, batch.world)
         total = total + error(after, batch.moves[:, k])
-        history = torch.cat([history[:, 1:], after[:, None]], dim=1)
+        history, shared = _onwards(history, after), _aged(shared)
     return total / steps
+
+
+def _onwards(history: Tensor, after: Tensor) -> Tensor:
+    """`history` (N, H+1, D) a step later, with `after` (N, D) as its last frame."""
+    return torch.cat([history[:, 1:], after[:, None]], dim=1)
+
+
+def _aged(shared: Tensor | None) -> Tensor | None:
+    """The noise of `history` a step later: the frame that the model made has none."""
+    return None if shared is None else _onwards(shared, torch.zeros_like(shared[:, 0]))

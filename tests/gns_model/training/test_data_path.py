@@ -455,6 +455,62 @@ def test_what_no_state_foretells_leaves_the_motion_as_it_is(free_flight):
     assert settles(None) == pytest.approx(1.0, abs=0.05)
 
 
+def test_noise_of_the_history_does_not_weigh_its_scene(free_flight):
+    """Scenes that brake at 1, whose histories say otherwise by noise of which the model repeats
+    half: what costs least is to brake at 1 beside. Were the noise a part of what a scene counts by,
+    those whose noise cancels the braking would count most, and to brake harder would cost less."""
+    net, batch = ballistic(free_flight)
+    scene = torch.arange(len(batch.history))
+    unit = DT**2 * net.acceleration_std
+    back = torch.arange(batch.history.shape[1] - 1, -1, -1.0)
+    triangle = (back * (back - 1) / 2)[None, :, None] * unit
+    still = batch.history[:, -1:].expand_as(batch.history)
+    noise = torch.linspace(-1.5, 1.5, len(scene))[:, None]
+    shared = noise[..., None] * triangle
+    history = still - triangle + shared
+    last = history[:, -1] - history[:, -2]
+
+    def settles(shared):
+        def slope(braking):
+            given = torch.tensor(braking, requires_grad=True)
+            after = history[:, -1] + last + (0.5 * noise - given) * unit
+            move = last - unit
+            weighing = Emphasis(relative_to=0.3)
+            step_error(net, history, after, move, weighing, batch=scene, shared=shared).backward()
+            return float(given.grad)
+
+        return brentq(slope, -0.5, 3.0)
+
+    # What the model repeats in the step that it gives still counts, as one of several steps.
+    assert settles(shared) == pytest.approx(1.0, abs=0.12)
+    assert settles(None) > 1.3
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3])
+@pytest.mark.parametrize("backprop", [False, True])
+def test_noise_that_neighbours_share_is_known_and_leaves_the_target(free_flight, steps, backprop):
+    """A model that knows gravity and looks at no history loses nothing by it, in any step."""
+    net, _ = ballistic(free_flight)
+    windows = [index(free_flight, 3).read(0, frame) for frame in (2, 3, 4)]
+    plain, noisy = (
+        collate(
+            windows,
+            noise_std=0.0,
+            rng=np.random.default_rng(0),
+            device=torch.device("cpu"),
+            spacing=SPACING,
+            acceleration_noise=share,
+        )
+        for share in (0.0, 0.5)
+    )
+    assert plain.shared is None
+    assert noisy.shared.abs().max() > 0.1 * DT**2 * 9.81
+    torch.testing.assert_close(noisy.history - noisy.shared, plain.history, rtol=0, atol=1e-7)
+    with torch.no_grad():
+        loss = unrolled_loss(net, noisy, Emphasis(relative_to=0.3), steps=steps, backprop=backprop)
+        assert float(loss) < 1e-4
+
+
 def test_a_drift_is_asked_back(free_flight):
     """Falling too fast by c: the displacement of the third step is off by 3 c dt², after a drift of
     (1 + 2) c dt². To lose 1/R of that drift, the error to mend is 3 c dt² (1 + 1/R)."""
