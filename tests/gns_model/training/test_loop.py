@@ -15,8 +15,10 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from gns_model.data.windows import WindowIndex
 from gns_model.errors import FileFormatError
 from gns_model.learned.checkpoint import load_model
+from gns_model.learned.world import World
 from gns_model.training import Recipe, RecipeError, TrainingError, train
 from gns_model.training.progress import Display
 from gns_model.training.state import read_position
@@ -65,6 +67,34 @@ def test_training_learns_a_law_of_motion(tiny, tmp_path):
     assert trained["one_step"] < 0.5 * untrained["one_step"]
     assert trained["centroid_travel"] < 0.7 * untrained["centroid_travel"]
     assert trained["diverged"] == 0
+
+
+def test_with_noise_on_its_accelerations_a_model_repeats_less(tiny, tmp_path, slides):
+    """What changes of the next acceleration if those of the history are taken away, the last
+    velocity as it is. Slides brake at a rate that their velocity tells, too, and so gently that it
+    takes a large share to hide it."""
+
+    def repeats(share: float) -> float:
+        options = {"steps": 300, "unroll": 1, "acceleration_noise": share}
+        out = tmp_path / str(share)
+        simulator = load_model(train(Recipe.from_dict({**tiny, **options}), out))
+        config, squares = simulator.config, 0.0
+        windows = WindowIndex(
+            [slides], spacing=config.spacing, dt=config.dt, history=config.history
+        )
+        for source in range(len(windows.sources)):
+            window = windows.read(source, 8, mixture=0)
+            history = torch.from_numpy(window.history)
+            last = history[:, -1:] - history[:, -2:-1]
+            steps = torch.arange(config.history, -1, -1)[None, :, None]
+            even = history[:, -1:] - steps * last
+            world = World.from_scenes([window.scene], [len(history)], device=history.device)
+            with torch.no_grad():
+                change = simulator.model.step(history, world) - simulator.model.step(even, world)
+            squares += float(change.square().mean())
+        return squares**0.5 / len(windows.sources)
+
+    assert repeats(20.0) < 0.5 * repeats(0.0)
 
 
 def test_nothing_is_learned_from_the_steps_that_a_rollout_leaves_to_the_solver(tiny, tmp_path):
