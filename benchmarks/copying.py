@@ -8,7 +8,7 @@ a share of the standard deviation of the true ones; by how much those of the ste
 k, the part of a change of the accelerations in the history (all of them times 1.2, the last
 velocity as it is) that the model gives on to the next one. In a rollout the history is the model's
 own, so an error that all points share is repeated 1 / (1 - k) times: a model may have small errors
-here and still be off there (`gns_model/training/noise.py`). A minute or two a model.
+here and still be off there (`gns_model/training/noise.py`). Two minutes a model.
 """
 
 from __future__ import annotations
