@@ -156,14 +156,19 @@ def collate(
     noise_std: float,
     rng: np.random.Generator,
     device: torch.device,
-    spacing: float = 0.0,
     acceleration_noise: float = 0.0,
+    spacing: float | None = None,
 ) -> Batch:
     """Lay windows side by side and add noise (`noise`) to the history of what moves.
 
     The true displacements are taken between true positions, so that adding one to a noisy position
     corrects the target for the noise: a step that reproduces it ends with the true velocity.
+
+    Raises:
+        ValueError: `acceleration_noise` without the `spacing` of the points [m], which it needs.
     """
+    if acceleration_noise > 0 and spacing is None:
+        raise ValueError("acceleration_noise needs the spacing of the points")
     history = np.concatenate([w.history for w in windows])
     future = np.concatenate([w.future for w in windows])
     kinds = np.concatenate([w.particle_type for w in windows])
@@ -171,7 +176,7 @@ def collate(
     moves = np.diff(future, axis=1, prepend=history[:, -1:])
     moving = kinds != STATIONARY
     shared = None
-    if acceleration_noise > 0:
+    if acceleration_noise > 0 and spacing is not None:
         each = [shared_acceleration(rng, w.history, spacing, acceleration_noise) for w in windows]
         shared = np.concatenate(each) * moving[:, None, None]
         history = history + shared
