@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 
 import torch
+from torch import Tensor
 
 from gns_model.errors import GnsError
 from gns_model.learned.config import ModelConfig
@@ -21,10 +22,10 @@ from gns_model.learned.model import LearnedModel
 from gns_model.training.recipe import RecipeError
 
 #: What may differ between the two configurations: the weights do not depend on it, or, for the
-#: last three, `inherit` makes room.
+#: last four, `inherit` makes room.
 FREE = {
     "noise_std", "subcells", "limits", "bounds", "solver_steps", "crowding_limit",
-    "material_features", "depth_range", "strain_unit",
+    "material_features", "depth_range", "strain_unit", "history",
 }  # fmt: skip
 
 #: What is as long as the scale. What strain and depth are measured in does not grow with it.
@@ -40,9 +41,11 @@ _FIRST = "network.encode_{}.layers.0.weight"
 def inherit(model: LearnedModel, start_from: str) -> None:
     """Copy weights and normalisation of the model `start_from` into `model`, in place.
 
-    Material, depth and strain features that only `model` has get weights of zero: it begins by
-    ignoring them, and moves points exactly as its parent does, or, if its lengths are λ times the
-    parent's, as the parent does a flow of that scale. A `crowding_limit` of its own acts at once.
+    Material, depth and strain features and earlier velocities that only `model` has get weights of
+    zero: it begins by ignoring them, and moves points exactly as its parent does, or, if its
+    lengths are λ times the parent's, as the parent does a flow of that scale. Where its history is
+    the shorter one, it begins as if every point had always moved as in the first velocity that it
+    sees. A `crowding_limit` of its own acts at once.
 
     Args:
         start_from: a shipped model or a checkpoint folder.
@@ -69,10 +72,23 @@ def inherit(model: LearnedModel, start_from: str) -> None:
         if own != known:
             weight = state[_FIRST.format(what)]
             columns = dict(zip(known, weight.unbind(1), strict=True))
+            if what == "vertex":
+                _shorten(columns, mine, theirs)
             state[_FIRST.format(what)] = torch.stack(
                 [columns.get(name, torch.zeros_like(weight[:, 0])) for name in own], dim=1
             )
     model.load_state_dict(state)
+
+
+def _shorten(columns: dict[str, Tensor], mine: ModelConfig, theirs: ModelConfig) -> None:
+    """Add the weights of velocities before the history of `mine` to those of its first, in place.
+
+    Every velocity is normalised alike, so that this is what the parent makes of steady motion.
+    """
+    for age in range(mine.history, theirs.history):
+        for axis in range(mine.dim):
+            first = _velocity(mine.history - 1, axis)
+            columns[first] = columns[first] + columns.pop(_velocity(age, axis))
 
 
 def _scale(mine: ModelConfig, theirs: ModelConfig, name: str) -> float:
@@ -112,11 +128,19 @@ def _vertex_inputs(config: ModelConfig) -> list[str]:
     strain = [f"strain {k}" for k in range(config.strain_inputs)]
     material = list(config.material_features)
     embedded = config.type_embedding if config.types else 0
-    surroundings = range(config.vertex_inputs - len(depth) - len(strain) - len(material))
+    ages, axes = range(config.history - 1, -1, -1), range(config.dim)
+    velocities = [_velocity(age, axis) for age in ages for axis in axes]
+    known = len(velocities) + len(depth) + len(strain) + len(material)
+    surroundings = range(config.vertex_inputs - known)
     return [
-        *(f"surroundings {k}" for k in surroundings), *depth, *strain, *material,
+        *velocities, *(f"surroundings {k}" for k in surroundings), *depth, *strain, *material,
         *(f"type {k}" for k in range(embedded)),
     ]  # fmt: skip
+
+
+def _velocity(age: int, axis: int) -> str:
+    """The name of a velocity that was the last one `age` steps ago."""
+    return f"velocity {axis}, {age} steps ago"
 
 
 def _edge_inputs(config: ModelConfig) -> list[str]:

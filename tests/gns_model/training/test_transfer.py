@@ -82,6 +82,38 @@ def test_new_features_change_nothing_at_first(tmp_path, slides, types, more, new
     assert (first.grad[:, begin : begin + new].abs().sum(0) > 0).all()
 
 
+def test_a_shorter_history_begins_as_if_points_had_moved_steadily(tmp_path, slides):
+    given = batch(slides)
+    model = build(types=9, material_features=("base_friction",))
+    folder = save_model(tmp_path / "parent", model)
+    child = build(seed=1, types=9, material_features=("base_friction",), history=1)
+    inherit(child, str(folder))
+    before, now = given.history[:, -2], given.history[:, -1]
+    steady = torch.stack([now - k * (now - before) for k in (3, 2, 1, 0)], dim=1)
+    with torch.no_grad():
+        torch.testing.assert_close(
+            child.step(given.history[:, -2:], given.world),
+            model.step(steady, given.world),
+            rtol=0,
+            atol=1e-6,
+        )
+
+
+def test_a_longer_history_changes_nothing_at_first(tmp_path, slides):
+    given = batch(slides)
+    model = build(history=2)
+    folder = save_model(tmp_path / "parent", model)
+    child = build(seed=1, history=3)
+    inherit(child, str(folder))
+    with torch.no_grad():
+        torch.testing.assert_close(
+            child.step(given.history, given.world),
+            model.step(given.history[:, -3:], given.world),
+            rtol=0,
+            atol=1e-7,
+        )
+
+
 def test_features_that_the_parent_knows_keep_their_weights_in_any_order(tmp_path, slides):
     given = batch(slides)
     model = build(material_features=("tan_friction_angle",))
