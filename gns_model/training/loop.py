@@ -78,7 +78,7 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: Stop) ->
     state_file = out / FILE
     try:
         with stop.may_abandon():
-            data = open_data(recipe, recipe.train, begin=recipe.model.solver_steps)
+            data = open_data(recipe, recipe.train, learn=True)
             held_out = open_data(recipe, recipe.valid) if recipe.valid else None
             run = begin(recipe, data, state_file, ranks, resume)
     except (Abandoned, RankError):

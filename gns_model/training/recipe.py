@@ -46,6 +46,9 @@ class Recipe(BaseModel):
     #: Use only flows that are let go, not thrown: impacts hold nearly all the squares of a loss,
     #: and a column never sees one.
     at_rest: bool = False
+    #: Learn from a flow until it comes to a wall that it did not stand at, and no further: what
+    #: follows is an impact, too. See `gns_model.data.impact`.
+    before_impact: bool = False
     valid_rollouts: Count = 8  #: trajectories that a validation simulates, spread over the ranks
     valid_windows: Count = 32  #: windows of the one-step validation loss
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from gns_model.data.impact import frames_before_impact
 from gns_model.data.windows import Source, WindowIndex
 from gns_model.learned.config import Limits, ModelConfig
 from gns_model.learned.model import LearnedModel
@@ -24,11 +25,12 @@ from gns_model.training.transfer import inherit
 from gns_model.training.validation import Scores
 
 
-def open_data(recipe: Recipe, folders: tuple[str, ...], *, begin: int = 0) -> WindowIndex:
+def open_data(recipe: Recipe, folders: tuple[str, ...], *, learn: bool = False) -> WindowIndex:
     """The windows that `recipe` reads from `folders`, every file checked.
 
     Args:
-        begin: see `WindowIndex`; to learn from, not to judge rollouts by.
+        learn: leave out the steps that are no matter of the model: those that the solver takes
+            and, with `before_impact`, those at the end. Rollouts are judged on whole flows.
 
     Raises:
         FileFormatError, RecipeError: as `train`.
@@ -39,7 +41,7 @@ def open_data(recipe: Recipe, folders: tuple[str, ...], *, begin: int = 0) -> Wi
         dt=recipe.model.dt,
         history=recipe.model.history,
         unroll=recipe.unroll,
-        begin=begin,
+        begin=recipe.model.solver_steps if learn else 0,
     )
     if index.dim != recipe.model.dim:
         raise RecipeError(
@@ -51,7 +53,20 @@ def open_data(recipe: Recipe, folders: tuple[str, ...], *, begin: int = 0) -> Wi
             raise RecipeError(f"{folders[0]}: at_rest = true, but every flow in it is thrown")
     for source in index.sources:
         _check_fits(recipe.model, source)
+    if learn and recipe.before_impact:
+        _stop_at_impacts(index, folders[0])
     return index
+
+
+def _stop_at_impacts(index: WindowIndex, folder: str) -> None:
+    """Shorten every flow to what comes before it strikes a wall, in place."""
+    whole = index.sources
+    index.sources = [replace(s, frames=frames_before_impact(s, index.spacing)) for s in whole]
+    index.sources = [s for k, s in enumerate(index.sources) if index.starts(k) >= 1]
+    if not index.sources:
+        raise RecipeError(
+            f"{folder}: before_impact = true, but every flow in it strikes a wall at once"
+        )
 
 
 def _begins_at_rest(source: Source) -> bool:
