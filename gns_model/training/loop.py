@@ -141,7 +141,10 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: Stop) ->
     sizes = [p.numel() for p in parameters]
     started_at, bad = position.step, 0
     unit, scale = ("steps", 1.0) if recipe.steps is not None else ("minutes", 60.0)
-    with Display(out, ranks, step=position.step, total=budget / scale, unit=unit) as display:
+    spent = (position.step if recipe.steps is not None else position.seconds) / scale
+    with Display(
+        out, ranks, step=position.step, done=spent, total=budget / scale, unit=unit
+    ) as display:
         if ranks.rank == 0:
             display.say(
                 f"{recipe.name}: {sum(sizes)} parameters, {len(data.sources)} trajectories"

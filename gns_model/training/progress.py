@@ -25,14 +25,20 @@ class Display:
     `log.csv` has a row every few seconds (means since the last one), `validation.csv` one for each
     validation, and `tensorboard/` both, if TensorBoard is installed; after a resume, what lies
     beyond the step that is resumed is dropped.
+
+    Args:
+        step, done: where the run stands as it begins, in steps and in `unit`.
+        total: the budget, in `unit`.
     """
 
-    def __init__(self, out: Path, ranks: Ranks, *, step: int, total: float, unit: str) -> None:
+    def __init__(
+        self, out: Path, ranks: Ranks, *, step: int, done: float, total: float, unit: str
+    ) -> None:
         self.out, self.active = out, ranks.rank == 0
         self.total, self.unit = total, unit
         self._sums: dict[str, float] = {}
         self._count, self._since = 0, time.monotonic()
-        self._done = 0.0
+        self._done = done
         self._bar = progress_bar(quiet=not self.active)
         self._live = self.active and self._bar.console.is_terminal
         if self.active:
@@ -43,7 +49,7 @@ class Display:
     def __enter__(self) -> Display:
         if self._live:
             self._bar.start()
-            self._task = self._bar.add_task("training", total=self.total)
+            self._task = self._bar.add_task("training", total=self.total, completed=self._done)
         if self.active and not self._events.on:
             self.say("no TensorBoard logs: pip install 'gns-baffles[train]' adds them to the CSV")
         return self

@@ -6,8 +6,10 @@ import sys
 
 import numpy as np
 import pytest
+import torch
 
-from gns_model.training import Recipe, train
+from gns_model.training import Recipe, progress, train
+from gns_model.training.distributed import Ranks
 from gns_model.training.logs import Events, Table, read_table
 from gns_model.training.loss_figure import plot, smoothed
 
@@ -116,3 +118,15 @@ def test_the_loss_history_is_drawn_with_and_without_validation(tmp_path):
         checks.add({"step": step, "seconds": step, "score": 3.0, "one_step": 0.1, "energy": 0.2})
     plot(tmp_path)
     assert imread(tmp_path / "loss.png").shape[0] > 1.5 * low[0]
+
+
+def test_the_time_left_of_a_resumed_run_counts_from_where_it_resumed(tmp_path, monkeypatch, capsys):
+    """A tenth of a minute in six seconds: the 37.1 that are left of 50 take 37.1 minutes."""
+    now = iter([0.0, 6.0, 6.0])
+    monkeypatch.setattr(progress.time, "monotonic", lambda: next(now))
+    monkeypatch.setattr(progress, "EVERY", 5.0)
+    ranks = Ranks(0, 1, torch.device("cpu"))
+    values = {"loss": 1.0, "learning_rate": 1e-3, "edges_per_second": 1e5}
+    display = progress.Display(tmp_path, ranks, step=100, done=12.8, total=50.0, unit="minutes")
+    display.step(101, 774.0, 12.9, values)
+    assert "0:37:0" in capsys.readouterr().out
