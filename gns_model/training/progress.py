@@ -49,7 +49,11 @@ class Display:
     def __enter__(self) -> Display:
         if self._live:
             self._bar.start()
-            self._task = self._bar.add_task("training", total=self.total, completed=self._done)
+            self._task = self._bar.add_task(
+                "training",
+                total=self.total,
+                completed=self._done,  # type: ignore[arg-type]  # minutes; rich counts any number
+            )
         if self.active and not self._events.on:
             self.say("no TensorBoard logs: pip install 'gns-baffles[train]' adds them to the CSV")
         return self

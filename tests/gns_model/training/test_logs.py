@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -123,7 +124,7 @@ def test_the_loss_history_is_drawn_with_and_without_validation(tmp_path):
 def test_the_time_left_of_a_resumed_run_counts_from_where_it_resumed(tmp_path, monkeypatch, capsys):
     """A tenth of a minute in six seconds: the 37.1 that are left of 50 take 37.1 minutes."""
     now = iter([0.0, 6.0, 6.0])
-    monkeypatch.setattr(progress.time, "monotonic", lambda: next(now))
+    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=lambda: next(now)))
     monkeypatch.setattr(progress, "EVERY", 5.0)
     ranks = Ranks(0, 1, torch.device("cpu"))
     values = {"loss": 1.0, "learning_rate": 1e-3, "edges_per_second": 1e5}
