@@ -123,7 +123,9 @@ class ModelConfig(BaseModel):
     subcells: Annotated[int, Field(ge=1)] = 1
     dt: Positive = 0.0125  #: stride of one step [s]
     radius: Positive = 0.05  #: points closer than this are joined by an edge [m]
-    history: Annotated[int, Field(ge=1)] = 3  #: number of past velocities that it sees
+    #: Number of past velocities that it sees. With one it cannot repeat its last acceleration,
+    #: errors included (`gns_model.training.noise`); the paper's sees five.
+    history: Annotated[int, Field(ge=1)] = 3
 
     #: Points are their own neighbours, too, as in geoelements/gns.
     self_edges: bool = False
