@@ -1,9 +1,9 @@
 """When a flow strikes a wall that it did not stand at.
 
-The impact is a jump of several g in a step or two, which hardly anything foretells and a flow with
-room never sees. Where a third of the flows end at a wall, a tenth of the windows hold more than
-half of all squared errors, relative to what moves the scene, and what is learned of the rest is
-what that leaves (docs/training.md, "One velocity, and no impacts").
+Its accelerations then rise several times over within a step, which hardly anything foretells and a
+flow with room never sees. Of squares that collapse in a box of 1.5 m, the quarter of the windows
+that follows an impact held 63% of all squared errors, relative to what moves the scene, and what is
+learned of the rest is what that leaves (docs/training.md, "One velocity, and no impacts").
 """
 
 from __future__ import annotations

@@ -167,8 +167,6 @@ def collate(
     Raises:
         ValueError: `acceleration_noise` without the `spacing` of the points [m], which it needs.
     """
-    if acceleration_noise > 0 and spacing is None:
-        raise ValueError("acceleration_noise needs the spacing of the points")
     history = np.concatenate([w.history for w in windows])
     future = np.concatenate([w.future for w in windows])
     kinds = np.concatenate([w.particle_type for w in windows])
@@ -176,7 +174,9 @@ def collate(
     moves = np.diff(future, axis=1, prepend=history[:, -1:])
     moving = kinds != STATIONARY
     shared = None
-    if acceleration_noise > 0 and spacing is not None:
+    if acceleration_noise > 0:
+        if spacing is None:
+            raise ValueError("acceleration_noise needs the spacing of the points")
         each = [shared_acceleration(rng, w.history, spacing, acceleration_noise) for w in windows]
         shared = np.concatenate(each) * moving[:, None, None]
         history = history + shared

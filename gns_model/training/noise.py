@@ -15,7 +15,7 @@ single points does not hide what they share, their neighbours tell; this noise d
 accelerations of the history a field that is smooth in place and the same at all times, and leaves
 the last position, the last velocity and the target as they are. The next acceleration must then be
 told by where the points are and how they move. A history of one velocity asks for the same and
-leaves nothing to repeat; it takes longer to learn.
+leaves nothing to repeat.
 """
 
 from __future__ import annotations
