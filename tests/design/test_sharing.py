@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -87,18 +88,36 @@ def worker(storage, method, budget, salt, until):
     log.close()
 
 
-def kill_within_a_trial(storage, name, pids, after=0):
-    """End the first of some workers that runs trials, once so many are told: the study, the
-    trials' numbers, and which worker it was."""
+def study_of(storage, name, processes):
+    """The study that workers make, once they have made it."""
     address = storage.replace("postgresql:", "postgresql+psycopg:")
-    study, backend, end = None, None, time.monotonic() + 300
-    while time.monotonic() < end:
-        time.sleep(0.05)
-        try:  # one storage for all tries: each keeps its connection, and a server has so many
+    backend = None
+    for _ in while_they_run(processes):
+        with suppress(Exception):  # it is being made
+            # One storage for all tries: each keeps its connection, and a server has so many.
             backend = backend or optuna.storages.RDBStorage(address)
-            study = study or optuna.load_study(study_name=name, storage=backend)
-        except Exception:  # it is being made
-            continue
+            return optuna.load_study(study_name=name, storage=backend)
+    raise AssertionError("no worker made a study")
+
+
+def while_they_run(processes):
+    """Looks, twenty in a second, until all processes have ended."""
+    end = time.monotonic() + 300
+    while time.monotonic() < end and not all(ended(p) for p in processes):
+        yield
+        time.sleep(0.05)
+
+
+def ended(process):
+    popen = isinstance(process, subprocess.Popen)
+    return (process.poll() if popen else process.exitcode) is not None
+
+
+def kill_within_a_trial(study, processes, after=0):
+    """End the first of some workers that runs trials, once so many are told: the trials' numbers,
+    and which worker it was."""
+    pids = [p.pid for p in processes]
+    for _ in while_they_run(processes):
         trials = study.get_trials(deepcopy=False)
         busy = [k for k, pid in enumerate(pids) if runs(trials, pid)]
         if sum(t.state.name == "COMPLETE" for t in trials) < after or not busy:
@@ -112,8 +131,8 @@ def kill_within_a_trial(storage, name, pids, after=0):
             asked = set()
         os.kill(pid, signal.SIGKILL if asked else signal.SIGCONT)
         if asked:
-            return study, asked, busy[0]
-    raise AssertionError("it ran no trial")
+            return asked, busy[0]
+    raise AssertionError("the workers ended before one was met within a trial")
 
 
 def runs(trials, pid):
@@ -130,15 +149,16 @@ def test_workers_share_a_budget_and_one_is_killed(storage, method):
     budget = 40
     context = multiprocessing.get_context("forkserver")  # pays for the imports once
     context.set_forkserver_preload([__name__, "optuna", "design.methods", "cvxpy", "psycopg"])
-    start = context.Barrier(3)
+    start = context.Barrier(4)  # three workers and who looks on: their search takes seconds
     workers = [
         context.Process(target=worker, args=(storage, method, budget, salt, start))
         for salt in (1, 2, 3)
     ]
     for process in workers:
         process.start()
-    pids = [process.pid for process in workers]
-    study, asked, killed = kill_within_a_trial(storage, "test", pids, after=6)
+    study = study_of(storage, "test", workers)
+    start.wait(300)
+    asked, killed = kill_within_a_trial(study, workers, after=6)
     dead = workers.pop(killed)
     for process in (dead, *workers):
         process.join(300)
@@ -246,8 +266,8 @@ def test_the_command_on_two_machines_of_which_one_dies(server, scene_file, tmp_p
         )
         for name in names
     ]  # fmt: skip
-    pids = [process.pid for process in processes]
-    study, asked, killed = kill_within_a_trial(storage, "gns-design", pids)
+    study = study_of(storage, "gns-design", processes)
+    asked, killed = kill_within_a_trial(study, processes)
     processes.pop(killed).communicate()
     dead, alive = names.pop(killed), names[0]
     out, err = processes[0].communicate(timeout=300)
