@@ -104,7 +104,7 @@ class WindowIndex:
     """All windows of the trajectory files (`*.h5`) in one or more folders.
 
     Opening checks every file but reads no frames; what stays in memory is one byte a point.
-    Trajectories that ended badly (status other than "ok") are left out and listed in `skipped`.
+    Trajectories that ended badly (status other than "ok") are left out; `skipped` says why.
 
     Args:
         folders: where the files are; each must hold at least one.
@@ -134,7 +134,8 @@ class WindowIndex:
         self.spacing, self.dt, self.history, self.unroll = spacing, dt, history, unroll
         self.begin = begin
         self.sources: list[Source] = []
-        self.skipped: list[Path] = []
+        #: What no window is read from, and why.
+        self.skipped: dict[Path, str] = {}
         for folder in map(Path, folders):
             paths = sorted(p for p in folder.glob("*.h5") if not p.name.startswith("."))
             if not paths:
@@ -142,7 +143,7 @@ class WindowIndex:
             for path in paths:
                 source = read_source(path, spacing=spacing)
                 if source is None:
-                    self.skipped.append(path)
+                    self.skipped[path] = "ended badly"
                     continue
                 self._stride(source)
                 self.sources.append(source)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections import Counter
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
@@ -148,7 +149,10 @@ def _train(recipe: Recipe, out: Path, resume: bool, ranks: Ranks, stop: Stop) ->
         if ranks.rank == 0:
             display.say(
                 f"{recipe.name}: {sum(sizes)} parameters, {len(data.sources)} trajectories"
-                + (f" ({len(data.skipped)} that ended badly left out)" if data.skipped else "")
+                + "".join(
+                    f" ({count} that {why} left out)"
+                    for why, count in Counter(data.skipped.values()).items()
+                )
                 + (f", {len(held_out.sources)} held out" if held_out else "")
                 + f", {ranks.world} rank(s), {'bfloat16' if short else 'float32'}"
                 + (f", resumed at step {position.step}" if position.step else "")

@@ -60,9 +60,12 @@ def open_data(recipe: Recipe, folders: tuple[str, ...], *, learn: bool = False) 
 
 def _stop_at_impacts(index: WindowIndex, folder: str) -> None:
     """Shorten every flow to what comes before it strikes a wall, in place."""
-    whole = index.sources
-    index.sources = [replace(s, frames=frames_before_impact(s, index.spacing)) for s in whole]
-    index.sources = [s for k, s in enumerate(index.sources) if index.starts(k) >= 1]
+    index.sources = [
+        replace(s, frames=frames_before_impact(s, index.spacing)) for s in index.sources
+    ]
+    struck = [s for k, s in enumerate(index.sources) if index.starts(k) < 1]
+    index.skipped |= {s.path: "strike a wall at once" for s in struck}
+    index.sources = [s for s in index.sources if s.path not in index.skipped]
     if not index.sources:
         raise RecipeError(
             f"{folder}: before_impact = true, but every flow in it strikes a wall at once"

@@ -220,7 +220,7 @@ def test_trajectories_that_ended_badly_are_left_out(tmp_path):
     moved(scene()).save(tmp_path / "good.h5")
     windows = index(tmp_path)
     assert [s.path.name for s in windows.sources] == ["good.h5"]
-    assert [p.name for p in windows.skipped] == ["bad.h5"]
+    assert {p.name: why for p, why in windows.skipped.items()} == {"bad.h5": "ended badly"}
 
 
 def test_2d_and_3d_do_not_mix(tmp_path):

@@ -6,7 +6,7 @@ import pytest
 from gns_model.data.impact import CLEARANCE, frames_before_impact
 from gns_model.mpm import MpmSimulator
 from gns_model.scene import Scene
-from gns_model.training import Recipe, RecipeError
+from gns_model.training import Recipe, RecipeError, train
 from gns_model.training.setup import open_data
 from gns_model.trajectory import Trajectory
 
@@ -69,7 +69,7 @@ def test_no_window_reads_what_follows(folder):
             assert last.future[..., 0].max() <= WIDTH - CLEARANCE * SPACING
 
 
-def test_flows_that_all_strike_at_once_are_refused(folder, tmp_path):
+def test_flows_that_all_strike_at_once_are_refused(folder, tmp_path, capsys):
     scene = square(WIDTH - 0.5, 2.0, "late")
     [flow] = MpmSimulator(spacing=SPACING, frame_interval=0.01).rollout([scene])
     flow.save(tmp_path / "late.h5")
@@ -78,3 +78,11 @@ def test_flows_that_all_strike_at_once_are_refused(folder, tmp_path):
     too_long = recipe(tmp_path, before_impact=True, unroll=10)
     with pytest.raises(RecipeError, match="strikes a wall at once"):
         open_data(too_long, (str(tmp_path),), learn=True)
+
+    # Beside others it is left out, and said.
+    (tmp_path / "stands.h5").symlink_to(folder / "stands.h5")
+    index = open_data(too_long, (str(tmp_path),), learn=True)
+    assert [source.path.stem for source in index.sources] == ["stands"]
+    assert index.skipped == {tmp_path / "late.h5": "strike a wall at once"}
+    train(too_long, tmp_path / "run")
+    assert "1 trajectories (1 that strike a wall at once left out)" in capsys.readouterr().out
