@@ -166,6 +166,9 @@ def generate(
     frame_interval: Annotated[
         float, typer.Option(min=1e-6, help="Between stored frames in s.")
     ] = 0.01,
+    jitter: Annotated[
+        float, typer.Option(min=0.0, help="Starts off their lattice by up to so many spacings.")
+    ] = 0.0,
     solver: Annotated[
         Solver | None,
         typer.Option(help="Engine of the solver.", show_default="numba; on a GPU torch"),
@@ -190,6 +193,7 @@ def generate(
             seed=seed,
             spacing=spacing,
             frame_interval=frame_interval,
+            jitter=jitter,
             workers=workers,
             solver=solver and solver.value,
             device=device,

@@ -14,6 +14,7 @@ import json
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from gns_model.data.scenes import draw
 from gns_model.errors import FileFormatError, GnsError, SimulatorError
@@ -52,6 +53,7 @@ def generate(
     seed: int = 0,
     spacing: float | None = None,
     frame_interval: float = 0.01,
+    jitter: float = 0.0,
     workers: int = 1,
     solver: str | None = None,
     device: str = "cpu",
@@ -71,6 +73,8 @@ def generate(
         seed: of the scenes.
         spacing: of the solver's points [m]; default: the paper's.
         frame_interval: between stored frames [s].
+        jitter: how far the points of a start are moved off their lattice at random, in spacings,
+            every scene's in its own way; see `mpm.problem.Discretisation`.
         workers: processes of the numba solver, one thread each.
         solver: "numba" or "torch"; default: what suits the device. Files agree within round-off.
         device: "cpu", or for the torch solver "cuda".
@@ -96,8 +100,8 @@ def generate(
     part, parts = shard
     indices = range(part, count, parts)
     paths = {index: out / file_name(family, seed, index) for index in indices}
-    made_with = {"spacing": spacing, "frame_interval": frame_interval}
-    missing = [i for i, path in paths.items() if not _is_there(path, family, seed, i, made_with)]
+    settings = {"spacing": spacing, "frame_interval": frame_interval, "jitter": jitter}
+    missing = [i for i, path in paths.items() if not _is_there(path, family, seed, i, settings)]
     finished = len(paths) - len(missing)
     if progress is not None:
         progress(finished, len(paths))
@@ -108,38 +112,39 @@ def generate(
         if progress is not None:
             progress(finished + made, len(paths))
 
-    todo = [(paths[i], draw(family, seed, i)) for i in missing]
+    todo = [(paths[i], draw(family, seed, i), i if jitter else 0) for i in missing]
     if solver == "numba":
         from gns_model.mpm.side_by_side import write_trajectories
 
-        settings = {"spacing": spacing, "frame_interval": frame_interval}
-        write_trajectories(todo, workers, settings, progress=report)
+        write_trajectories(
+            [(path, scene, {**settings, "filling": filling}) for path, scene, filling in todo],
+            workers,
+            progress=report,
+        )
     else:
-        _by_batches(todo, batch, spacing, frame_interval, device, report)
+        _by_batches(todo, batch, settings, device, report)
     return list(paths.values())
 
 
 def _by_batches(
-    todo: Sequence[tuple[Path, Scene]],
+    todo: Sequence[tuple[Path, Scene, int]],
     batch: int,
-    spacing: float | None,
-    interval: float,
+    settings: dict[str, Any],
     device: str,
     report: Callable[[float], None],
 ) -> None:
     from gns_model.mpm.torch_solver import TorchMpmSimulator
 
-    simulator = TorchMpmSimulator(
-        spacing=spacing, frame_interval=interval, device=device, batch=batch
-    )
+    simulator = TorchMpmSimulator(**settings, device=device, batch=batch)
     for first in range(0, len(todo), batch):
         some = todo[first : first + batch]
 
         def within(fraction: float, first: int = first, size: int = len(some)) -> None:
             report(first + fraction * size)
 
-        trajectories = simulator.rollout([scene for _, scene in some], progress=within)
-        for (path, _), trajectory in zip(some, trajectories, strict=True):
+        _, scenes, fillings = zip(*some, strict=True)
+        trajectories = simulator.rollout(scenes, fillings=fillings, progress=within)
+        for (path, *_), trajectory in zip(some, trajectories, strict=True):
             trajectory.save(path)
 
 
@@ -150,7 +155,7 @@ def _is_there(
         return False
     with open_trajectory(path) as file:
         scene = json.loads(file.attrs["scene"])
-        settings = json.loads(file.attrs["settings"])
+        settings = {"jitter": 0.0, **json.loads(file.attrs["settings"])}  # older files say none
     if scene.get("name") != draw(family, seed, index).name:
         raise FileFormatError(f"{path}: holds scene {scene.get('name')!r}, of another dataset")
     for key, value in wanted.items():

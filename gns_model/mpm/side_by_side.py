@@ -16,18 +16,17 @@ from gns_model.workers import Workers, report, results
 
 
 def write_trajectories(
-    todo: Sequence[tuple[Path, Scene]],
+    todo: Sequence[tuple[Path, Scene, Mapping[str, Any]]],
     workers: int,
-    settings: Mapping[str, Any],
     *,
     progress: Callable[[float], None],
 ) -> None:
     """Simulate every scene and write its trajectory to its path, whole, as soon as it is there.
 
     Args:
-        todo: paths of HDF5 files and the scenes that go into them; a file there is replaced.
+        todo: paths of HDF5 files, the scenes that go into them and keyword arguments of
+            `MpmSimulator`; a file there is replaced.
         workers: processes, one thread each.
-        settings: keyword arguments of `MpmSimulator`.
         progress: called with the number of scenes done, parts of scenes included.
 
     Raises:
@@ -35,7 +34,7 @@ def write_trajectories(
         SimulatorError, SceneError: if the solver cannot run a scene.
     """
     with Workers(min(workers, len(todo)), advice="a rerun with fewer --workers goes on") as pool:
-        jobs = [pool.submit(_write, path, scene, dict(settings)) for path, scene in todo]
+        jobs = [pool.submit(_write, path, scene, dict(own)) for path, scene, own in todo]
         results(jobs, lambda fraction: progress(fraction * len(jobs)))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -86,12 +86,17 @@ class TorchMpmSimulator:
         self.chosen.check(scene)
 
     def rollout(
-        self, scenes: Sequence[Scene], *, progress: Progress | None = None
+        self,
+        scenes: Sequence[Scene],
+        *,
+        fillings: Sequence[int] | None = None,
+        progress: Progress | None = None,
     ) -> list[Trajectory]:
         """Simulate every scene for its duration.
 
         Args:
             scenes: any mixture of 2D and 3D.
+            fillings: `filling` of every scene, in place of the simulator's.
             progress: called with the fraction done.
 
         Returns:
@@ -103,7 +108,9 @@ class TorchMpmSimulator:
         """
         for scene in scenes:
             self.check(scene)
-        problems = [pose(scene, self.chosen) for scene in scenes]
+        own = [self.chosen.filling] * len(scenes) if fillings is None else fillings
+        choices = [replace(self.chosen, filling=filling) for filling in own]
+        problems = [pose(scene, c) for scene, c in zip(scenes, choices, strict=True)]
         work = [p.count * p.frames * p.substeps for p in problems]
         finished = 0.0
         results: dict[int, Trajectory] = {}
@@ -127,7 +134,7 @@ class TorchMpmSimulator:
                 ) from None
             seconds = (time.perf_counter() - started) / len(group)
             for k, film, bad_frame in zip(group, positions, bad_frames, strict=True):
-                settings = {**self.settings(), "seconds": seconds}
+                settings = {**self.settings(), **asdict(choices[k]), "seconds": seconds}
                 results[k] = problems[k].trajectory(film, bad_frame, settings)
             finished += share
         return [results[k] for k in range(len(scenes))]

@@ -50,16 +50,12 @@ def references(
     missing = [k for k, trajectory in enumerate(found) if trajectory is None]
     if missing:
         progress = stage(f"reference solver, {len(missing)} scene{'s' * (len(missing) > 1)}")
-        todo = [(files[k], scenes[k]) for k in missing]
+        settings = {"spacing": spacing, "frame_interval": interval}
+        todo = [(files[k], scenes[k], settings) for k in missing]
         if threads > 1 and len(missing) > 1:
-            write_trajectories(
-                todo,
-                threads,
-                {"spacing": spacing, "frame_interval": interval},
-                progress=lambda done: progress(done / len(todo)),
-            )
+            write_trajectories(todo, threads, progress=lambda done: progress(done / len(todo)))
         else:
-            for done, (file, scene) in enumerate(todo):
+            for done, (file, scene, _) in enumerate(todo):
 
                 def advance(fraction: float, done: int = done) -> None:
                     progress((done + fraction) / len(todo))

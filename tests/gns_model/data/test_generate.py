@@ -63,7 +63,25 @@ def test_an_interrupt_keeps_whole_batches_and_a_rerun_goes_on(by_torch, tmp_path
         )
 
 
-@pytest.mark.parametrize("other", [{"spacing": 0.05}, {"frame_interval": 0.01}])
+def test_every_scene_is_filled_in_its_own_way(by_torch, tmp_path):
+    for solver in ("torch", "numba"):
+        generate(tmp_path / solver, **WANTED, jitter=0.25, solver=solver, batch=2)
+    ways = []
+    for i in range(3):
+        name = file_name("barriers", 4, i)
+        lattice = Trajectory.load(by_torch[0] / name)
+        a, b = (Trajectory.load(tmp_path / solver / name) for solver in ("numba", "torch"))
+        assert a.settings["filling"] == b.settings["filling"] == i
+        np.testing.assert_allclose(a.positions, b.positions, rtol=0, atol=1e-6)
+        shift = (a.positions[0] - lattice.positions[0]) / WANTED["spacing"]
+        assert 0.2 < np.abs(shift).max() <= 0.25 + 1e-6
+        ways.append(shift[:20])
+    assert not np.allclose(ways[0], ways[1])
+    with pytest.raises(SimulatorError, match="jitter"):
+        generate(tmp_path / "far", **WANTED, jitter=0.5, workers=1)
+
+
+@pytest.mark.parametrize("other", [{"spacing": 0.05}, {"frame_interval": 0.01}, {"jitter": 0.1}])
 def test_files_of_another_dataset_are_refused(by_torch, other):
     with pytest.raises(FileFormatError, match=next(iter(other))):
         generate(by_torch[0], **{**WANTED, **other}, solver="torch")
