@@ -156,7 +156,10 @@ def _identity(simulator: Any) -> Hashable:
 
 
 def _weights(simulator: Any) -> str:
-    words = (simulator.config.model_dump_json(), simulator.device.type, simulator.precision)
+    words = (
+        simulator.config.model_dump_json(), simulator.device.type, simulator.precision,
+        simulator.filling, simulator.jitter,
+    )  # fmt: skip
     digest = hashlib.sha256(repr(words).encode())
     for name, tensor in sorted(simulator.model.state_dict().items()):
         digest.update(f"{name}{tensor.dtype}".encode())

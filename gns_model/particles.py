@@ -28,12 +28,15 @@ class Points:
         lattice: integer lattice coordinates within the release, shape (N, D). Points whose
             lattice agrees modulo n form a lattice of n times the spacing.
         spacing: [m].
+        jitter, filling: how they were moved off their lattice, see `shaken`.
     """
 
     positions: np.ndarray
     velocities: np.ndarray
     lattice: np.ndarray
     spacing: float
+    jitter: float = 0.0
+    filling: int = 0
 
     @property
     def volume(self) -> float:
@@ -60,7 +63,7 @@ def shaken(points: Points, jitter: float, draw: int = 0) -> Points:
     up to half of one: another filling of the same releases. The same `draw` moves it likewise."""
     most = jitter * points.spacing
     shift = np.random.default_rng(draw).uniform(-most, most, points.positions.shape)
-    return replace(points, positions=points.positions + shift)
+    return replace(points, positions=points.positions + shift, jitter=jitter, filling=draw)
 
 
 def fill(scene: Scene, spacing: float) -> Points:

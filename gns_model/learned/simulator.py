@@ -20,7 +20,7 @@ from gns_model.learned.precision import Precision, is_short
 from gns_model.learned.predict import Array, Bounds, predict_positions
 from gns_model.learned.rollout import batch_points, groups, place, roll_out, roll_out_tensor
 from gns_model.learned.start import Start, frame_count, shifted, start
-from gns_model.particles import MOVING, Points, fill, scatter
+from gns_model.particles import MOVING, Points, fill, scatter, shaken
 from gns_model.scene import Scene
 from gns_model.simulator import Progress
 from gns_model.trajectory import DIVERGED, OK, Trajectory
@@ -39,7 +39,9 @@ class LearnedSimulator:
             CPU that has instructions for it (several times slower on one that has none), much on a
             GPU, at half a percent of error in each step's acceleration. "auto": where it is faster.
         filling: seed of the places in their cells that points start from; of no effect on a model
-            without `subcells`.
+            without `subcells` unless there is `jitter`.
+        jitter: how far the points of the start are moved off their lattice, in spacings; below a
+            half of one. The reference solver with the same `jitter` and `filling` starts likewise.
     """
 
     def __init__(
@@ -52,7 +54,10 @@ class LearnedSimulator:
         workers: int = 1,
         precision: Precision = "float32",
         filling: int = 0,
+        jitter: float = 0.0,
     ) -> None:
+        if not 0 <= jitter < 0.5:
+            raise SimulatorError(f"jitter must be 0 or more and below 0.5, got {jitter}")
         if precision not in get_args(Precision):
             raise SimulatorError(f"precision must be float32, bfloat16 or auto, got {precision!r}")
         for option, value in (("threads", threads), ("workers", workers)):
@@ -65,7 +70,7 @@ class LearnedSimulator:
         self.threads = threads
         self.workers = workers
         self.precision: Precision = "bfloat16" if is_short(precision, self.device) else "float32"
-        self.filling = filling
+        self.filling, self.jitter = filling, jitter
         self._warned: set[str] = set()
         self._pool: Any = None
 
@@ -95,7 +100,8 @@ class LearnedSimulator:
                 )
 
     def _fill(self, scene: Scene) -> Points:
-        return scatter(fill(scene, self.config.spacing), self.config.subcells, self.filling)
+        points = scatter(fill(scene, self.config.spacing), self.config.subcells, self.filling)
+        return shaken(points, self.jitter, self.filling) if self.jitter else points
 
     def perturbed_start(self, scene: Scene, draw: int) -> Tensor:
         """Displacements [m], shape (N, D), to another start of the same flow, for `noise`; draw 0
@@ -240,7 +246,10 @@ class LearnedSimulator:
     def _trajectory(
         self, scene: Scene, point_volume: float, positions: np.ndarray, diverged: int | None
     ) -> Trajectory:
-        settings: dict[str, Any] = {"spacing": self.config.spacing, "dt": self.config.dt}
+        settings: dict[str, Any] = {
+            "spacing": self.config.spacing, "dt": self.config.dt,
+            "jitter": self.jitter, "filling": self.filling,
+        }  # fmt: skip
         if diverged is not None:
             settings["diverged_at"] = diverged * self.config.dt
         return Trajectory(

@@ -78,7 +78,7 @@ def start(
         history = position[:, None] - velocity[:, None] * (past * config.dt)[:, None]
         before = None
         if config.solver_steps:
-            solved = solver_frames(config, scene).to(position)
+            solved = solver_frames(config, scene, begin).to(position)
             before = solved[: frame_count(config, scene)]
             history = torch.cat([history[:, :-1], before.transpose(0, 1)], dim=1)
             history = history[:, -len(past) :]
@@ -112,11 +112,17 @@ def shifted(scene: Scene, spacing: float, subcells: int, filling: int, draw: int
     return shift
 
 
-def solver_frames(config: ModelConfig, scene: Scene) -> Tensor:
-    """Frames 0 to `solver_steps` of `scene` by the reference solver, shape (K, N, D) [m]."""
+def solver_frames(config: ModelConfig, scene: Scene, points: Points) -> Tensor:
+    """Frames 0 to `solver_steps` of `scene` by the reference solver, shape (K, N, D) [m], from
+    the filling that `points` are."""
     from gns_model.mpm import MpmSimulator
 
-    solver = MpmSimulator(spacing=config.spacing, frame_interval=config.dt)
+    solver = MpmSimulator(
+        spacing=config.spacing,
+        frame_interval=config.dt,
+        jitter=points.jitter,
+        filling=points.filling,
+    )
     short = scene.replace(duration=config.solver_steps * config.dt)
     return torch.from_numpy(solver.rollout([short])[0].positions)
 

@@ -37,7 +37,11 @@ class WorkerPool:
             config.model_dump_json(),
             state,
             simulator.name,
-            {"precision": simulator.precision, "filling": simulator.filling},
+            {
+                "precision": simulator.precision,
+                "filling": simulator.filling,
+                "jitter": simulator.jitter,
+            },
         )
 
     def rollout(self, scenes: Sequence[Scene], progress: Progress | None) -> list[Trajectory]:

@@ -81,6 +81,8 @@ def test_a_learned_model_is_known_by_its_weights(is_shipped: bool, flume: Scene)
     assert scene_key(one, flume) == scene_key(two, flume)
     next(other.model.parameters()).data[0] += 1e-6
     assert scene_key(one, flume) != scene_key(other, flume)
+    for choice in ({"filling": 1}, {"jitter": 0.2}):
+        assert scene_key(one, flume) != scene_key(load_simulator("baffle-lite", **choice), flume)
 
 
 def test_copies_share_the_cache_of_the_process() -> None:

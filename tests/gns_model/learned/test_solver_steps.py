@@ -36,6 +36,27 @@ def test_a_rollout_begins_with_the_solvers_frames_and_goes_on_by_itself(simulato
     assert np.abs(found.positions[STEPS + 1] - solved.positions[STEPS + 1]).max() > 1e-6
 
 
+def test_another_filling_is_the_solvers_too(simulator):
+    chosen = {"jitter": 0.25, "filling": 3}
+    solved = MpmSimulator(spacing=SPACING, frame_interval=DT, **chosen).rollout([column()])[0]
+    other = LearnedSimulator(simulator.model, **chosen)
+    found = other.rollout([column()])[0]
+    np.testing.assert_array_equal(found.positions[: STEPS + 1], solved.positions[: STEPS + 1])
+    assert {**found.settings, **chosen} == found.settings
+    usual = simulator.rollout([column()])[0].positions
+    assert 0.2 < np.abs(found.positions[0] - usual[0]).max() / SPACING <= 0.25 + 1e-6
+    tensor = other.rollout_tensor([column()])[0]
+    np.testing.assert_allclose(tensor.detach(), found.positions, atol=1e-6)
+    shared = LearnedSimulator(simulator.model, **chosen, workers=2)
+    try:
+        for trajectory in shared.rollout([column(), column()]):
+            np.testing.assert_allclose(trajectory.positions, found.positions, atol=1e-6)
+    finally:
+        shared.close()
+    with pytest.raises(SimulatorError, match="jitter"):
+        LearnedSimulator(simulator.model, jitter=0.5)
+
+
 def test_the_network_sees_the_solvers_motion(simulator):
     """Its first own step is one step from a history that ends with the solver's frames."""
     found = simulator.rollout([column()])[0].positions
