@@ -8,12 +8,8 @@ what the mean over the fillings changes, and by how much they differ among each 
 deviation), in per cent of the lattice's value. A model that differs from the solver by less than
 that cannot be told from it by that measure. Two layouts are compared on the lattice, so what the
 change differs from one to the other is what their comparison may be off by: REPEATABILITY in
-`design/wording.py`. Twenty CPU minutes, shared by the processes.
-
-    python benchmarks/fillings.py --models column-2d
-
-asks learned models of columns for the same columns from the same fillings, and says how far they
-are off on the lattice, and in the mean over the fillings: five minutes.
+`design/wording.py`. Twenty CPU minutes, shared by the processes. Learned models from the same
+fillings: `gns-model evaluate MODEL --suite columns --fillings 8`.
 """
 
 from __future__ import annotations
@@ -33,7 +29,6 @@ parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("--jitter", type=float, default=0.25, help="largest shift, in spacings")
 parser.add_argument("--fillings", type=int, default=8)
 parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-parser.add_argument("--models", nargs="+", default=(), help="learned models of columns")
 
 FLUME = Scene.from_toml(Path(__file__).parent.parent / "examples" / "flume.toml")
 FLUMES = {
@@ -62,59 +57,15 @@ def cells(values: list[dict[str, float]], name: str) -> list[str]:
     return [f"{changes.mean():+.1f}", f"{changes.std(ddof=1):.1f}"]
 
 
-def runs_of(
-    name: str, scenes: list[Scene], arguments: argparse.Namespace
-) -> list[list[Trajectory]]:
-    """All scenes from the lattice, then from every filling."""
-    ways = [(0.0, 0)] + [(arguments.jitter, k + 1) for k in range(arguments.fillings)]
-    runs = []
-    for jitter, filling in ways:
-        simulator = load_simulator(name, workers=arguments.workers, jitter=jitter, filling=filling)
-        runs.append(simulator.rollout(scenes))
-        if name != "mpm":
-            simulator.close()  # type: ignore[attr-defined]
-    return runs
-
-
-def held_against(
-    references: list[list[Trajectory]],
-    columns: list[Scene],
-    title: str,
-    arguments: argparse.Namespace,
-) -> None:
-    """Errors of learned models, lattice against lattice and mean against mean."""
-    true = [[column_measures(trajectory) for trajectory in run] for run in references]
-    for name in arguments.models:
-        runs = runs_of(name, columns, arguments)
-        found = [[column_measures(trajectory) for trajectory in run] for run in runs]
-        rows = []
-        for measure in true[0][0]:
-            a, b = (
-                np.array([[column[measure] for column in run] for run in some])
-                for some in (found, true)
-            )
-            for start, error in (
-                ("lattice", a[0] / b[0] - 1),
-                ("mean of fillings", a[1:].mean(0) / b[1:].mean(0) - 1),
-            ):
-                cells = [f"{100 * e:+.1f}" for e in error]
-                rows.append([measure, start, *cells, f"{100 * np.abs(error).mean():.1f}"])
-        print_table(
-            f"{name} against the solver, {title}: error of the travel, in %",
-            ["measure", "start", *(f"a={c.aspect:g}" for c in paper.COLUMNS), "mean |.|"],
-            rows,
-        )
-
-
 def main() -> None:
     arguments = parser.parse_args()
-    title = f"{arguments.fillings} fillings, up to {arguments.jitter:g} spacings off the lattice"
-    columns = [paper.column_scene(column) for column in paper.COLUMNS]
-    if arguments.models:
-        held_against(runs_of("mpm", columns, arguments), columns, title, arguments)
-        return
-    runs = runs_of("mpm", [*columns, *FLUMES.values()], arguments)
+    scenes = [*(paper.column_scene(column) for column in paper.COLUMNS), *FLUMES.values()]
+    runs = [
+        load_simulator("mpm", workers=arguments.workers, jitter=jitter, filling=k).rollout(scenes)
+        for k, jitter in enumerate([0.0] + [arguments.jitter] * arguments.fillings)
+    ]
     by_scene = list(zip(*runs, strict=True))
+    title = f"{arguments.fillings} fillings, up to {arguments.jitter:g} spacings off the lattice"
     rows = []
     for column, found in zip(paper.COLUMNS, by_scene, strict=False):
         values = [column_measures(trajectory) for trajectory in found]

@@ -56,8 +56,6 @@ class LearnedSimulator:
         filling: int = 0,
         jitter: float = 0.0,
     ) -> None:
-        if not 0 <= jitter < 0.5:
-            raise SimulatorError(f"jitter must be 0 or more and below 0.5, got {jitter}")
         if precision not in get_args(Precision):
             raise SimulatorError(f"precision must be float32, bfloat16 or auto, got {precision!r}")
         for option, value in (("threads", threads), ("workers", workers)):
@@ -70,7 +68,7 @@ class LearnedSimulator:
         self.threads = threads
         self.workers = workers
         self.precision: Precision = "bfloat16" if is_short(precision, self.device) else "float32"
-        self.filling, self.jitter = filling, jitter
+        self.filling, self.jitter = filling, _below_half(jitter)
         self._warned: set[str] = set()
         self._pool: Any = None
 
@@ -102,6 +100,12 @@ class LearnedSimulator:
     def _fill(self, scene: Scene) -> Points:
         points = scatter(fill(scene, self.config.spacing), self.config.subcells, self.filling)
         return shaken(points, self.jitter, self.filling) if self.jitter else points
+
+    def refilled(self, jitter: float, filling: int) -> LearnedSimulator:
+        """The same model on starts off their lattice, see the arguments of the class."""
+        other = copy.copy(self)
+        other.filling, other.jitter = filling, _below_half(jitter)
+        return other
 
     def perturbed_start(self, scene: Scene, draw: int) -> Tensor:
         """Displacements [m], shape (N, D), to another start of the same flow, for `noise`; draw 0
@@ -370,3 +374,9 @@ class LearnedSimulator:
                 sizes=sizes,
                 yaws=yaws,
             )
+
+
+def _below_half(jitter: float) -> float:
+    if not 0 <= jitter < 0.5:
+        raise SimulatorError(f"jitter must be 0 or more and below 0.5, got {jitter}")
+    return jitter

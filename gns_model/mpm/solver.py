@@ -83,6 +83,10 @@ class MpmSimulator:
         most: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
         return min(self.threads, most) if count >= THREAD_POINTS else 1
 
+    def refilled(self, jitter: float, filling: int) -> MpmSimulator:
+        """The same solver on starts off their lattice, see `Discretisation`."""
+        return MpmSimulator(**{**self.settings(), "jitter": jitter, "filling": filling})
+
     def check(self, scene: Scene) -> None:
         """Raise SimulatorError if `scene` would not fit in memory."""
         self.chosen.check(scene)

@@ -81,6 +81,10 @@ class TorchMpmSimulator:
         own = {"device": str(self.device), "batch": self.batch, "cuda_graph": self.cuda_graph}
         return {**asdict(self.chosen), **own}
 
+    def refilled(self, jitter: float, filling: int) -> TorchMpmSimulator:
+        """The same solver on starts off their lattice, see `Discretisation`."""
+        return TorchMpmSimulator(**{**self.settings(), "jitter": jitter, "filling": filling})
+
     def check(self, scene: Scene) -> None:
         """Raise SimulatorError if `scene` would not fit in memory."""
         self.chosen.check(scene)

@@ -41,6 +41,12 @@ def height_over_time(trajectory: Trajectory) -> np.ndarray:
     return measures.height_over_time(trajectory) / length
 
 
+def centroid_travel(trajectory: Trajectory) -> float:
+    """How far the centroid has gone at the last frame [m], along x."""
+    x = measures.centroid_over_time(trajectory)[:, 0]
+    return float(x[-1] - x[0])
+
+
 def collapse_row(pair: Pair) -> Row:
     """Runout and what else there is to say of one column, learned and by our own solver."""
     row: Row = {
@@ -48,6 +54,7 @@ def collapse_row(pair: Pair) -> Row:
         "runout_mpm": measures.normalised_runout(pair.reference),
     }
     row["runout_error"] = relative(row["runout"], row["runout_mpm"])
+    row["centroid_error"] = relative(*(centroid_travel(t) for _, t in pair.both()))
     for suffix, trajectory in pair.both():
         row[f"height{suffix}"] = float(height_over_time(trajectory)[-1])
         row[f"dissipated{suffix}"] = float(energies(trajectory)["dissipated"][-1])
@@ -86,9 +93,11 @@ def collapse_curves(pair: Pair, **labels: float) -> list[Row]:
     ]
 
 
-def runout_aims(rows: Sequence[Row], pairs: Sequence[Pair], over: str) -> list[Aim]:
-    """The aims for the runouts in `rows`; a rollout that diverged misses both."""
-    errors = [abs(row["runout_error"]) for row in rows]
+def runout_aims(
+    rows: Sequence[Row], pairs: Sequence[Pair], over: str, key: str = "runout_error"
+) -> list[Aim]:
+    """The aims for the errors `key` in `rows`; a rollout that diverged misses both."""
+    errors = [abs(row[key]) for row in rows]
     good = all(pair.good for pair in pairs)
     return [
         Aim(f"runout error, the largest over {over}", max(errors) if good else None, RUNOUT_AIM),

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from gns_model import paper
 from gns_model.simulator import Simulator
-from gns_model.suites import column_figures, frames
+from gns_model.suites import column_figures, fillings, frames
 from gns_model.suites.collapse import (
     collapse_curves,
     collapse_row,
     paper_columns,
     runout_aims,
 )
+from gns_model.suites.fillings import filling_aims, filling_columns, simulate_fillings
 from gns_model.suites.pair import CLOSING, PAPERS_RUNOUTS, RUNOUTS, outside, simulate
 from gns_model.suites.result import SuiteResult
 from gns_model.suites.setup import Setup
@@ -34,15 +35,18 @@ def run(simulator: Simulator, setup: Setup) -> SuiteResult:
     Raises:
         SimulatorError, SceneError: if the simulator cannot run them.
     """
-    pairs = simulate(simulator, [paper.column_scene(c) for c in paper.COLUMNS], setup)
+    scenes = [paper.column_scene(c) for c in paper.COLUMNS]
+    pairs = simulate(simulator, scenes, setup)
+    others = simulate_fillings(simulator, scenes, setup)
     rows, curves = [], []
-    for column, pair in zip(paper.COLUMNS, pairs, strict=True):
+    for column, pair, other in zip(paper.COLUMNS, pairs, others, strict=True):
         rows.append(
             {
                 "aspect": column.aspect,
                 "height_0": column.height,
                 "length_0": column.length,
                 **collapse_row(pair),
+                **filling_columns(other),
                 **paper_columns(column),
                 **pair.facts(),
             }
@@ -64,12 +68,16 @@ def run(simulator: Simulator, setup: Setup) -> SuiteResult:
         suite="columns",
         title=f"Normalised runout of columns: {name} beside our MPM and the paper",
         rows=rows,
-        warnings=outside(simulator, [pair.scene for pair in pairs]),
-        shown=SHOWN,
-        aims=runout_aims(rows, pairs, "the aspect ratios"),
+        warnings=outside(simulator, scenes),
+        shown=(*SHOWN, *(fillings.SHOWN if setup.fillings else ())),
+        aims=[
+            *runout_aims(rows, pairs, "the aspect ratios"),
+            *filling_aims(rows, others, "the aspect ratios"),
+        ],
         notes=[
             "Runout is that of the farthest point in the last frame. Errors are shares of the "
-            "MPM's runout; the paper's own table divides by its GNS's."
+            "MPM's runout; the paper's own table divides by its GNS's. Centroid: the error of how "
+            "far the centroid went."
         ],
         curves={"columns-curves": [row for curve in curves for row in curve]},
         files=files,

@@ -67,6 +67,10 @@ def evaluate(
         float,
         typer.Option(min=0.1, help="Seconds a device that the speed and training suites may take."),
     ] = 300.0,
+    fillings: Annotated[
+        int,
+        typer.Option(min=0, help="Columns and friction also from so many starts off the lattice."),
+    ] = 0,
     device: Annotated[Device, typer.Option(help="auto: the GPU, if there is one.")] = Device.auto,
     workers: Annotated[
         int,
@@ -80,6 +84,8 @@ def evaluate(
     """Judge a simulator: by the paper's tables and figures, or on trajectories it has not seen."""
     if (suite is None) == (data is None):
         raise GnsError("give either --suite or --data, one of the two")
+    if fillings and suite not in (SuiteName.columns, SuiteName.friction, SuiteName.all):
+        raise GnsError("--fillings is for --suite columns, friction or all")
     if data is not None:
         _on_data(model, data, out, count, gradients, device, workers, as_json, quiet)
         return
@@ -88,7 +94,7 @@ def evaluate(
         raise GnsError("a suite writes tables and figures: give their folder, --out DIR")
     if spacing is not None and not spacing > 0:
         raise GnsError(f"--spacing must be positive, got {spacing:g}")
-    _by_suites(model, suite, out, spacing, budget, device, workers, as_json, quiet)
+    _by_suites(model, suite, out, spacing, budget, fillings, device, workers, as_json, quiet)
 
 
 def _by_suites(
@@ -97,6 +103,7 @@ def _by_suites(
     out: Path,
     spacing: float | None,
     budget: float,
+    fillings: int,
     device: Device,
     workers: int,
     as_json: bool,
@@ -118,7 +125,7 @@ def _by_suites(
             return lambda fraction: bar.update(task, completed=fraction)
 
         results: list[SuiteResult] = []
-        setup = Setup(out, spacing, workers, found, budget, stage)
+        setup = Setup(out, spacing, workers, found, budget, fillings, stage)
         report = run_suites(simulator, suite.value, setup, finished=results.append)
     for name in report["left_out"].keys() - left_out.keys():
         print(f"left out: {name}: {report['left_out'][name]}", file=sys.stderr)

@@ -7,8 +7,9 @@ from itertools import pairwise
 
 from gns_model import paper
 from gns_model.simulator import Simulator
-from gns_model.suites import column_figures
+from gns_model.suites import column_figures, fillings
 from gns_model.suites.collapse import collapse_row, runout_aims
+from gns_model.suites.fillings import filling_aims, filling_columns, simulate_fillings
 from gns_model.suites.pair import CLOSING, RUNOUTS, outside, simulate
 from gns_model.suites.result import Row, SuiteResult
 from gns_model.suites.setup import Setup
@@ -49,14 +50,16 @@ def run(simulator: Simulator, setup: Setup) -> SuiteResult:
         for angle, column in cases
     ]
     pairs = simulate(simulator, scenes, setup)
+    others = simulate_fillings(simulator, scenes, setup)
     rows: list[Row] = [
         {
             "friction_angle": angle,
             "aspect": column.aspect,
             **collapse_row(pair),
+            **filling_columns(other),
             **pair.facts(),
         }
-        for (angle, column), pair in zip(cases, pairs, strict=True)
+        for (angle, column), pair, other in zip(cases, pairs, others, strict=True)
     ]
     column_figures.runout_by_friction(rows, simulator.name, setup.out / "friction.png")
     reason = blind(simulator)
@@ -65,8 +68,11 @@ def run(simulator: Simulator, setup: Setup) -> SuiteResult:
         title=f"Normalised runout by friction angle: {simulator.name} beside our MPM",
         rows=rows,
         warnings=outside(simulator, scenes),
-        shown=SHOWN,
-        aims=runout_aims(rows, pairs, "friction angles and aspect ratios"),
+        shown=(*SHOWN, *(fillings.SHOWN if setup.fillings else ())),
+        aims=[
+            *runout_aims(rows, pairs, "friction angles and aspect ratios"),
+            *filling_aims(rows, others, "friction angles and aspect ratios"),
+        ],
         facts={
             f"{key}_falls_with_friction": all(_falls(rows, aspect, key) for aspect in ASPECTS)
             for key in ("runout", "runout_mpm")

@@ -21,6 +21,7 @@ RUNOUTS = (
     ("runout_mpm", "our MPM", ".3f"),
     ("runout", "learned", ".3f"),
     ("runout_error", "error", "+.1%"),
+    ("centroid_error", "centroid", "+.1%"),
 )
 PAPERS_RUNOUTS = (
     ("paper_mpm", "paper's MPM", ".3f"),
@@ -66,8 +67,19 @@ class Pair:
         }
 
 
-def simulate(simulator: Simulator, scenes: Sequence[Scene], setup: Setup) -> list[Pair]:
+def simulate(
+    simulator: Simulator,
+    scenes: Sequence[Scene],
+    setup: Setup,
+    *,
+    jitter: float = 0.0,
+    filling: int = 0,
+) -> list[Pair]:
     """Run the simulator and, where it is not kept already, the reference on every scene.
+
+    Args:
+        jitter, filling: of the reference, see `mpm.problem.Discretisation`; the simulator has its
+            own.
 
     Raises:
         SimulatorError, SceneError: if one of them cannot run a scene.
@@ -80,6 +92,8 @@ def simulate(simulator: Simulator, scenes: Sequence[Scene], setup: Setup) -> lis
         interval=stride(simulator),
         spacing=setup.spacing,
         threads=setup.threads,
+        jitter=jitter,
+        filling=filling,
         stage=setup.stage,
     )
     progress = setup.stage(f"{simulator.name}, {len(scenes)} scene{'s' * (len(scenes) > 1)}")

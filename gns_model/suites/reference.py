@@ -11,6 +11,7 @@ import json
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from gns_model import mpm, particles
 from gns_model.errors import FileFormatError, SimulatorError
@@ -31,6 +32,8 @@ def references(
     interval: float,
     spacing: float | None = None,
     threads: int = 1,
+    jitter: float = 0.0,
+    filling: int = 0,
     stage: Callable[[str], Progress],
 ) -> list[Trajectory]:
     """The solver's trajectory of every scene, read from `folder` or simulated and kept there.
@@ -39,18 +42,21 @@ def references(
         interval: between frames [s].
         spacing: of the solver's points [m]; default: the solver's own.
         threads: of the solver, or processes for several scenes; its results do not depend on it.
+        jitter, filling: of the solver, see `mpm.problem.Discretisation`.
         stage: opens a progress bar, if there is anything to simulate.
 
     Raises:
         SimulatorError: if the solver cannot run a scene or diverges on it.
     """
-    solver = MpmSimulator(spacing=spacing, frame_interval=interval, threads=threads)
+    settings: dict[str, Any] = {
+        "spacing": spacing, "frame_interval": interval, "jitter": jitter, "filling": filling,
+    }  # fmt: skip
+    solver = MpmSimulator(**settings, threads=threads)
     files = [_file(scene, folder / FOLDER, solver) for scene in scenes]
     found = [_load(file, scene) for file, scene in zip(files, scenes, strict=True)]
     missing = [k for k, trajectory in enumerate(found) if trajectory is None]
     if missing:
         progress = stage(f"reference solver, {len(missing)} scene{'s' * (len(missing) > 1)}")
-        settings = {"spacing": spacing, "frame_interval": interval}
         todo = [(files[k], scenes[k], settings) for k in missing]
         if threads > 1 and len(missing) > 1:
             write_trajectories(todo, threads, progress=lambda done: progress(done / len(todo)))

@@ -91,6 +91,8 @@ def test_tables_and_warnings_for_a_person(capsys, plane_model: Path, tmp_path: P
         (["baffle-lite", "--suite", "columns", "--out", "x"], "its scenes are 2D and baffle-lite"),
         (["no-such-model", "--suite", "columns", "--out", "x"], "no simulator named"),
         (["mpm", "--data", "no-such-folder"], "no trajectory files"),
+        (["mpm", "--data", ".", "--fillings", "2"], "--fillings"),
+        (["mpm", "--suite", "flume", "--out", "x", "--fillings", "2"], "--fillings"),
     ],
 )
 def test_bad_input_is_one_line(capsys, monkeypatch, tmp_path: Path, arguments, says):
