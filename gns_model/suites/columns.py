@@ -69,7 +69,7 @@ def run(simulator: Simulator, setup: Setup) -> SuiteResult:
         title=f"Normalised runout of columns: {name} beside our MPM and the paper",
         rows=rows,
         warnings=outside(simulator, scenes),
-        shown=(*SHOWN, *(fillings.SHOWN if setup.fillings else ())),
+        shown=(*SHOWN[:1], *RUNOUTS, *fillings.SHOWN) if setup.fillings else SHOWN,
         aims=[
             *runout_aims(rows, pairs, "the aspect ratios"),
             *filling_aims(rows, others, "the aspect ratios"),

@@ -24,8 +24,8 @@ from gns_model.suites.setup import Setup
 JITTER = 0.25
 
 SHOWN = (
-    ("fillings_mpm", "fillings: MPM", ".3f"),
-    ("fillings_mpm_sd", "sd", ".3f"),
+    ("fillings_mpm", "fillings: our MPM", ".3f"),
+    ("fillings_mpm_sd", "its sd", ".3f"),
     ("fillings", "learned", ".3f"),
     ("fillings_error", "error", "+.1%"),
     ("fillings_centroid_error", "centroid", "+.1%"),

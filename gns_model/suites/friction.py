@@ -68,7 +68,7 @@ def run(simulator: Simulator, setup: Setup) -> SuiteResult:
         title=f"Normalised runout by friction angle: {simulator.name} beside our MPM",
         rows=rows,
         warnings=outside(simulator, scenes),
-        shown=(*SHOWN, *(fillings.SHOWN if setup.fillings else ())),
+        shown=(*SHOWN[:2], *RUNOUTS, *fillings.SHOWN) if setup.fillings else SHOWN,
         aims=[
             *runout_aims(rows, pairs, "friction angles and aspect ratios"),
             *filling_aims(rows, others, "friction angles and aspect ratios"),
