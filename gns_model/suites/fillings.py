@@ -2,7 +2,7 @@
 
 Real grains stand on no lattice, and where the farthest of them comes to rest is a matter of chance
 by some per cent (`benchmarks/fillings.py`). A model is held against the solver filling by filling,
-both from the same points, and the means are compared.
+both from the same points where their spacings are the same, and the means are compared.
 """
 
 from __future__ import annotations
