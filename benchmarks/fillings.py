@@ -41,12 +41,11 @@ MEASURES = ("runout_max", "runout_p99", "centroid_travel", "upstream_depth", "ma
 
 def column_measures(trajectory: Trajectory) -> dict[str, float]:
     """Of a column: how far its farthest point, its last hundredth and its centroid went."""
-    front, travelled = trajectory.scene.front, measures.centroid_over_time(trajectory)
     last = measures.front_over_time(trajectory, quantile=0.99)[-1]
     return {
         "farthest point": measures.normalised_runout(trajectory),
-        "p99": last - front,
-        "centroid": travelled[-1, 0] - travelled[0, 0],
+        "p99": last - trajectory.scene.front,
+        "centroid": measures.centroid_travel(trajectory),
     }
 
 

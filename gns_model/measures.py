@@ -65,7 +65,7 @@ def summary(trajectory: Trajectory) -> dict[str, float]:
     return {
         "runout_max": float(x.max() - x[0].max()),
         "runout_p99": _quantile(x[-1], FRONT_QUANTILE) - _quantile(x[0], FRONT_QUANTILE),
-        "centroid_travel": float(x[-1].mean(dtype=float) - x[0].mean(dtype=float)),
+        "centroid_travel": centroid_travel(trajectory),
         "mass_past_section": float((x[-1] > trajectory.scene.control_section).mean()),
         "upstream_depth": float(upstream_depth_over_time(trajectory).max(initial=0.0)),
         "overtopping": overtopping(trajectory),
@@ -109,6 +109,12 @@ def thinned_front_over_time(trajectory: Trajectory, points: int) -> np.ndarray:
 def centroid_over_time(trajectory: Trajectory) -> np.ndarray:
     """Centre of mass [m], shape (T, D)."""
     return moving_positions(trajectory).mean(axis=1, dtype=float)
+
+
+def centroid_travel(trajectory: Trajectory) -> float:
+    """How far the centroid has gone along x at the last frame [m]."""
+    x = centroid_over_time(trajectory)[:, 0]
+    return float(x[-1] - x[0])
 
 
 def height_over_time(trajectory: Trajectory) -> np.ndarray:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gns_model.errors import SceneError
+from gns_model.errors import SceneError, SimulatorError
 from gns_model.scene import Scene
 
 #: Particle types, as geoelements/gns numbers them.
@@ -64,6 +64,14 @@ def shaken(points: Points, jitter: float, draw: int = 0) -> Points:
     most = jitter * points.spacing
     shift = np.random.default_rng(draw).uniform(-most, most, points.positions.shape)
     return replace(points, positions=points.positions + shift, jitter=jitter, filling=draw)
+
+
+def check_filling(jitter: float, filling: int) -> None:
+    """Raise SimulatorError if points cannot be `shaken` so."""
+    if not 0 <= jitter < 0.5:
+        raise SimulatorError(f"jitter must be 0 or more and below 0.5, got {jitter}")
+    if filling < 0:
+        raise SimulatorError(f"filling must not be negative, got {filling}")
 
 
 def fill(scene: Scene, spacing: float) -> Points:

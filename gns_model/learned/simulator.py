@@ -20,7 +20,7 @@ from gns_model.learned.precision import Precision, is_short
 from gns_model.learned.predict import Array, Bounds, predict_positions
 from gns_model.learned.rollout import batch_points, groups, place, roll_out, roll_out_tensor
 from gns_model.learned.start import Start, frame_count, shifted, start
-from gns_model.particles import MOVING, Points, fill, scatter, shaken
+from gns_model.particles import MOVING, Points, check_filling, fill, scatter, shaken
 from gns_model.scene import Scene
 from gns_model.simulator import Progress
 from gns_model.trajectory import DIVERGED, OK, Trajectory
@@ -68,7 +68,8 @@ class LearnedSimulator:
         self.threads = threads
         self.workers = workers
         self.precision: Precision = "bfloat16" if is_short(precision, self.device) else "float32"
-        self.filling, self.jitter = filling, _below_half(jitter)
+        check_filling(jitter, filling)
+        self.filling, self.jitter = filling, jitter
         self._warned: set[str] = set()
         self._pool: Any = None
 
@@ -103,8 +104,9 @@ class LearnedSimulator:
 
     def refilled(self, jitter: float, filling: int) -> LearnedSimulator:
         """The same model on starts off their lattice, see the arguments of the class."""
+        check_filling(jitter, filling)
         other = copy.copy(self)
-        other.filling, other.jitter = filling, _below_half(jitter)
+        other.filling, other.jitter = filling, jitter
         return other
 
     def perturbed_start(self, scene: Scene, draw: int) -> Tensor:
@@ -374,9 +376,3 @@ class LearnedSimulator:
                 sizes=sizes,
                 yaws=yaws,
             )
-
-
-def _below_half(jitter: float) -> float:
-    if not 0 <= jitter < 0.5:
-        raise SimulatorError(f"jitter must be 0 or more and below 0.5, got {jitter}")
-    return jitter

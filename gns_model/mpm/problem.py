@@ -12,7 +12,7 @@ from gns_model.errors import SimulatorError
 from gns_model.mpm.contact import SKIN, solid_nodes
 from gns_model.mpm.material import MaterialConstants, material_constants, wave_speed
 from gns_model.mpm.transfer import PADDING, Lattice
-from gns_model.particles import MOVING, Points, fill, shaken
+from gns_model.particles import MOVING, Points, check_filling, fill, shaken
 from gns_model.scene import Scene
 from gns_model.trajectory import DIVERGED, OK, Trajectory
 
@@ -61,10 +61,7 @@ class Discretisation:
         )  # fmt: skip
         if not self.damping_rate >= 0:
             raise SimulatorError(f"damping_rate must not be negative, got {self.damping_rate}")
-        if not 0 <= self.jitter < 0.5:
-            raise SimulatorError(f"jitter must be 0 or more and below 0.5, got {self.jitter}")
-        if self.filling < 0:
-            raise SimulatorError(f"filling must not be negative, got {self.filling}")
+        check_filling(self.jitter, self.filling)
 
     def spacing_of(self, scene: Scene) -> float:
         """The spacing that `scene` is solved at [m]."""

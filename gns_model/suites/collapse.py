@@ -41,12 +41,6 @@ def height_over_time(trajectory: Trajectory) -> np.ndarray:
     return measures.height_over_time(trajectory) / length
 
 
-def centroid_travel(trajectory: Trajectory) -> float:
-    """How far the centroid has gone at the last frame [m], along x."""
-    x = measures.centroid_over_time(trajectory)[:, 0]
-    return float(x[-1] - x[0])
-
-
 def collapse_row(pair: Pair) -> Row:
     """Runout and what else there is to say of one column, learned and by our own solver."""
     row: Row = {
@@ -54,7 +48,7 @@ def collapse_row(pair: Pair) -> Row:
         "runout_mpm": measures.normalised_runout(pair.reference),
     }
     row["runout_error"] = relative(row["runout"], row["runout_mpm"])
-    row["centroid_error"] = relative(*(centroid_travel(t) for _, t in pair.both()))
+    row["centroid_error"] = relative(*(measures.centroid_travel(t) for _, t in pair.both()))
     for suffix, trajectory in pair.both():
         row[f"height{suffix}"] = float(height_over_time(trajectory)[-1])
         row[f"dissipated{suffix}"] = float(energies(trajectory)["dissipated"][-1])

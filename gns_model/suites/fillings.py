@@ -15,7 +15,7 @@ from gns_model import measures
 from gns_model.errors import SimulatorError
 from gns_model.scene import Scene
 from gns_model.simulator import Simulator
-from gns_model.suites.collapse import centroid_travel, runout_aims
+from gns_model.suites.collapse import runout_aims
 from gns_model.suites.pair import Pair, relative, simulate
 from gns_model.suites.result import Aim, Row
 from gns_model.suites.setup import Setup
@@ -63,7 +63,7 @@ def filling_columns(pairs: Sequence[Pair]) -> Row:
     learned = [measures.normalised_runout(pair.predicted) for pair in pairs]
     solved = [measures.normalised_runout(pair.reference) for pair in pairs]
     centroids = (
-        float(np.mean([centroid_travel(trajectory) for trajectory in some]))
+        float(np.mean([measures.centroid_travel(trajectory) for trajectory in some]))
         for some in zip(*((pair.predicted, pair.reference) for pair in pairs), strict=True)
     )
     mean, true = float(np.mean(learned)), float(np.mean(solved))
