@@ -224,6 +224,6 @@ class Panel:
 
 def beyond_limits(simulator: SimulatorSpec, scene: Scene) -> list[str]:
     """What of a scene with its baffles lies outside what a learned model was trained on."""
-    config = getattr(simulator.load(), "config", None)
-    lines = [] if config is None else config.limits.broken_by(scene)
+    outside = getattr(simulator.load(), "outside", None)
+    lines = [] if outside is None else outside(scene)
     return [f"the model was not trained for {line}" for line in lines]

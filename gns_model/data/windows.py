@@ -83,6 +83,9 @@ class Source:
     particle_type: np.ndarray | None = None  #: of foreign points, shape (N,) int8
     tan_friction: np.ndarray | None = None  #: of foreign points, shape (N,), if it is known
     plane: float | None = None  #: see `halves.plane_of_symmetry`
+    #: How far its points were moved off their lattice, in spacings of the model; 0, too, of foreign
+    #: ones, whose lattice is not known.
+    jitter: float = 0.0
 
     def points(self, residue: int) -> int:
         """Number of points in a tracer set."""
@@ -268,9 +271,10 @@ def read_source(path: Path, *, spacing: float) -> Source | None:
             lattice = file["lattice"][()] if "lattice" in file else None
             kinds = file["particle_type"][()]
             volume = float(file.attrs["point_volume"])
+            jitter = float(json.loads(file.attrs["settings"]).get("jitter", 0.0))
             foreign = bool(file.attrs.get("foreign", False))
             friction = file["tan_friction"][()] if "tan_friction" in file else None
-        except (KeyError, OSError, TypeError) as error:
+        except (KeyError, OSError, TypeError, ValueError) as error:
             raise FileFormatError(f"{path}: truncated or foreign ({error})") from None
     if len(shape) != 3 or shape[2] != scene.dim or volume <= 0:
         raise FileFormatError(f"{path}: positions {shape} do not fit a {scene.dim}D scene")
@@ -327,6 +331,7 @@ def read_source(path: Path, *, spacing: float) -> Source | None:
         cell=cell.astype(np.int32),
         counts=counts,
         plane=halves.plane_of_symmetry(scene),
+        jitter=jitter / ratio,
     )
 
 

@@ -173,6 +173,11 @@ class ModelConfig(BaseModel):
     #: while one step later velocities tell. The paper's rollouts begin with six frames of its MPM.
     solver_steps: Annotated[int, Field(ge=0)] = 0
 
+    #: How far the points of a start are moved off their lattice, in spacings: as in the flows that
+    #: it was trained on, from which training fills this in. Flows of a lattice and flows of
+    #: shaken points differ in more than their start: a model of one kind runs off on the other.
+    jitter: Annotated[float, Field(ge=0, lt=0.5)] = 0.0
+
     types: Annotated[int, Field(ge=0)] = 0  #: number of particle types to embed; 0: none
     type_embedding: Annotated[int, Field(ge=1)] = 16
     #: Properties of the scene that every vertex sees, in this order.
@@ -207,6 +212,12 @@ class ModelConfig(BaseModel):
         ):
             raise ValueError(f"bounds must be {self.dim} ordered pairs, got {self.bounds}")
         return self
+
+    def foreign_start(self, jitter: float) -> str | None:
+        """Why points that are moved by `jitter` spacings are no start that it was trained on."""
+        if self.subcells > 1 or bool(jitter) == bool(self.jitter):
+            return None
+        return f"jitter = {jitter:g}, but trained on starts moved by {self.jitter:g} spacings"
 
     @property
     def hidden_width(self) -> int:

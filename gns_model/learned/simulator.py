@@ -41,7 +41,8 @@ class LearnedSimulator:
         filling: seed of the places in their cells that points start from; of no effect on a model
             without `subcells` unless there is `jitter`.
         jitter: how far the points of the start are moved off their lattice, in spacings; below a
-            half of one. The reference solver with the same `jitter` and `filling` starts likewise.
+            half of one; default: as in what the model was trained on (`ModelConfig.jitter`). The
+            reference solver with the same `jitter` and `filling` starts likewise.
     """
 
     def __init__(
@@ -54,7 +55,7 @@ class LearnedSimulator:
         workers: int = 1,
         precision: Precision = "float32",
         filling: int = 0,
-        jitter: float = 0.0,
+        jitter: float | None = None,
     ) -> None:
         if precision not in get_args(Precision):
             raise SimulatorError(f"precision must be float32, bfloat16 or auto, got {precision!r}")
@@ -68,6 +69,7 @@ class LearnedSimulator:
         self.threads = threads
         self.workers = workers
         self.precision: Precision = "bfloat16" if is_short(precision, self.device) else "float32"
+        jitter = self.config.jitter if jitter is None else jitter
         check_filling(jitter, filling)
         self.filling, self.jitter = filling, jitter
         self._warned: set[str] = set()
@@ -89,7 +91,7 @@ class LearnedSimulator:
             SceneError: if a release is thinner than the spacing of the model.
         """
         scope.require(self.config, self.name, scene)
-        for line in self.config.limits.broken_by(scene):
+        for line in self.outside(scene):
             limit = line.split(" = ")[0]  # once for each limit, however many scenes pass it
             if limit not in self._warned:
                 self._warned.add(limit)
@@ -97,6 +99,11 @@ class LearnedSimulator:
                     f"scene {scene.name!r} is outside what {self.name} was trained on: {line}",
                     stacklevel=2,
                 )
+
+    def outside(self, scene: Scene) -> list[str]:
+        """One line for everything in which a rollout of `scene` is unlike the training flows."""
+        foreign = self.config.foreign_start(self.jitter)
+        return self.config.limits.broken_by(scene) + ([foreign] if foreign else [])
 
     def _fill(self, scene: Scene) -> Points:
         points = scatter(fill(scene, self.config.spacing), self.config.subcells, self.filling)

@@ -34,6 +34,15 @@ def curve(rows: Sequence[Row], key: str) -> np.ndarray:
     return np.array([row[key] for row in rows], float)
 
 
+def solved_and_learned(rows: Sequence[Row]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """The runouts that are judged: of our MPM, of the model, and the deviation of the first over
+    its fillings, where there are several."""
+    if "fillings" not in rows[0]:
+        return curve(rows, "runout_mpm"), curve(rows, "runout"), None
+    spread = None if rows[0]["fillings_mpm_sd"] is None else curve(rows, "fillings_mpm_sd")
+    return curve(rows, "fillings_mpm"), curve(rows, "fillings"), spread
+
+
 def tidy(axes: Axes) -> None:
     """A light grid behind everything."""
     axes.grid(color="0.92")
@@ -45,13 +54,20 @@ def runout_by_aspect(rows: Sequence[Row], name: str, path: Path) -> None:
     figure = Figure(figsize=(10.5, 4.4), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.25, 1))
     aspect = curve(rows, "aspect")
-    for key, label, style in (
-        ("paper_mpm", "paper's MPM", {"color": PAPER, "marker": "s", "mfc": "white"}),
-        ("paper_gns", "paper's GNS", {"color": PAPER, "marker": "^", "ls": ":", "mfc": "white"}),
-        ("runout_mpm", "our MPM", {"color": OURS, "marker": "s"}),
-        ("runout", name, {"color": LEARNED, "marker": "o", "ls": "--"}),
+    solved, learned, spread = solved_and_learned(rows)
+    hollow = {"color": PAPER, "mfc": "white"}
+    for values, label, style in (
+        (curve(rows, "paper_mpm"), "paper's MPM", {"marker": "s", **hollow}),
+        (curve(rows, "paper_gns"), "paper's GNS", {"marker": "^", "ls": ":", **hollow}),
+        (solved, "our MPM", {"color": OURS, "marker": "s"}),
+        (learned, name, {"color": LEARNED, "marker": "o", "ls": "--"}),
     ):
-        left.plot(aspect, curve(rows, key), label=label, markersize=6, linewidth=1.3, **style)
+        left.plot(aspect, values, label=label, markersize=6, linewidth=1.3, **style)
+    if spread is not None:
+        left.errorbar(
+            aspect, solved, spread, fmt="none", color=OURS, capsize=3, linewidth=1,
+            label="its deviation over fillings",
+        )  # fmt: skip
     left.set(
         xscale="log", yscale="log", xlabel=ASPECT,
         ylabel=RUNOUT,
@@ -65,7 +81,7 @@ def runout_by_aspect(rows: Sequence[Row], name: str, path: Path) -> None:
     left.legend(frameon=False)
 
     place = np.arange(len(rows))
-    ours, theirs = 100 * curve(rows, "runout_error"), 100 * curve(rows, "paper_error")
+    ours, theirs = 100 * (learned / solved - 1), 100 * curve(rows, "paper_error")
     right.axhspan(-100 * RUNOUT_AIM, 100 * RUNOUT_AIM, color="0.93")
     right.axhline(0, color="0.4", linewidth=0.8)
     right.bar(place - 0.2, ours, 0.38, color=LEARNED, label=f"{name} against our MPM")
@@ -209,9 +225,12 @@ def runout_by_friction(rows: Sequence[Row], name: str, path: Path) -> None:
         for value, colour in zip(values, colours, strict=True):
             line = [row for row in rows if row[each] == value]
             x = curve(line, along)
-            axes.plot(x, curve(line, "runout_mpm"), color=colour, marker="s", markersize=5)
+            solved, learned, spread = solved_and_learned(line)
+            axes.errorbar(
+                x, solved, spread, color=colour, marker="s", markersize=5, capsize=3, linewidth=1.5
+            )
             axes.plot(
-                x, curve(line, "runout"), color=colour, marker="o", markersize=6, mfc="white",
+                x, learned, color=colour, marker="o", markersize=6, mfc="white",
                 linestyle=(0, (3, 2)),
             )  # fmt: skip
         marks = [

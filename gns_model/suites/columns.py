@@ -4,15 +4,10 @@ from __future__ import annotations
 
 from gns_model import paper
 from gns_model.simulator import Simulator
-from gns_model.suites import column_figures, fillings, frames
-from gns_model.suites.collapse import (
-    collapse_curves,
-    collapse_row,
-    paper_columns,
-    runout_aims,
-)
-from gns_model.suites.fillings import filling_aims, filling_columns, simulate_fillings
-from gns_model.suites.pair import CLOSING, PAPERS_RUNOUTS, RUNOUTS, outside, simulate
+from gns_model.suites import column_figures, frames
+from gns_model.suites.collapse import collapse_curves, paper_columns
+from gns_model.suites.fillings import Starts
+from gns_model.suites.pair import CLOSING, PAPERS_RUNOUTS
 from gns_model.suites.result import SuiteResult
 from gns_model.suites.setup import Setup
 
@@ -20,13 +15,6 @@ from gns_model.suites.setup import Setup
 DRAWN = (0.5, 0.8, 2.0)
 #: Aspect ratios of which the paper shows the flow at several times.
 FRAMED = (0.8, 2.0)
-
-SHOWN = (
-    ("aspect", "a = H0/L0", "g"),
-    *RUNOUTS,
-    *PAPERS_RUNOUTS,
-    *CLOSING,
-)
 
 
 def run(simulator: Simulator, setup: Setup) -> SuiteResult:
@@ -36,23 +24,21 @@ def run(simulator: Simulator, setup: Setup) -> SuiteResult:
         SimulatorError, SceneError: if the simulator cannot run them.
     """
     scenes = [paper.column_scene(c) for c in paper.COLUMNS]
-    pairs = simulate(simulator, scenes, setup)
-    others = simulate_fillings(simulator, scenes, setup)
+    starts = Starts.simulate(simulator, scenes, setup)
     rows, curves = [], []
-    for column, pair, other in zip(paper.COLUMNS, pairs, others, strict=True):
+    for k, (column, pair) in enumerate(zip(paper.COLUMNS, starts.pairs, strict=True)):
         rows.append(
             {
                 "aspect": column.aspect,
                 "height_0": column.height,
                 "length_0": column.length,
-                **collapse_row(pair),
-                **filling_columns(other),
+                **starts.row(k),
                 **paper_columns(column),
                 **pair.facts(),
             }
         )
         curves.append(collapse_curves(pair, aspect=column.aspect))
-    by_aspect = dict(zip([c.aspect for c in paper.COLUMNS], pairs, strict=True))
+    by_aspect = dict(zip([c.aspect for c in paper.COLUMNS], starts.pairs, strict=True))
     out, name = setup.out, simulator.name
     column_figures.runout_by_aspect(rows, name, out / "columns.png")
     chosen = [c for c in curves if c[0]["aspect"] in DRAWN]
@@ -68,12 +54,9 @@ def run(simulator: Simulator, setup: Setup) -> SuiteResult:
         suite="columns",
         title=f"Normalised runout of columns: {name} beside our MPM and the paper",
         rows=rows,
-        warnings=outside(simulator, scenes),
-        shown=(*SHOWN[:1], *RUNOUTS, *fillings.SHOWN) if setup.fillings else SHOWN,
-        aims=[
-            *runout_aims(rows, pairs, "the aspect ratios"),
-            *filling_aims(rows, others, "the aspect ratios"),
-        ],
+        warnings=starts.warnings,
+        shown=(("aspect", "a = H0/L0", "g"), *starts.shown(*PAPERS_RUNOUTS, *CLOSING)),
+        aims=starts.aims(rows, "the aspect ratios"),
         notes=[
             "Runout is that of the farthest point in the last frame. Errors are shares of the "
             "MPM's runout; the paper's own table divides by its GNS's. Centroid: the error of how "

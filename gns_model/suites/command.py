@@ -39,6 +39,10 @@ class Device(StrEnum):
     cuda = "cuda"
 
 
+#: Suites of columns, which are run from several fillings, and how many.
+OF_COLUMNS = (SuiteName.columns, SuiteName.friction, SuiteName.upscaled, SuiteName.all)
+FILLINGS = 8
+
 CORES = os.cpu_count() or 1
 
 
@@ -68,9 +72,14 @@ def evaluate(
         typer.Option(min=0.1, help="Seconds a device that the speed and training suites may take."),
     ] = 300.0,
     fillings: Annotated[
-        int,
-        typer.Option(min=0, help="Columns and friction also from so many starts off the lattice."),
-    ] = 0,
+        int | None,
+        typer.Option(
+            min=0,
+            help="Starts off the lattice whose mean is judged, of columns, friction and upscaled; "
+            "0: one start only.",
+            show_default="8; 0 for a simulator without `refilled`",
+        ),
+    ] = None,
     device: Annotated[Device, typer.Option(help="auto: the GPU, if there is one.")] = Device.auto,
     workers: Annotated[
         int,
@@ -84,8 +93,8 @@ def evaluate(
     """Judge a simulator: by the paper's tables and figures, or on trajectories it has not seen."""
     if (suite is None) == (data is None):
         raise GnsError("give either --suite or --data, one of the two")
-    if fillings and suite not in (SuiteName.columns, SuiteName.friction, SuiteName.all):
-        raise GnsError("--fillings is for --suite columns, friction or all")
+    if fillings and suite not in OF_COLUMNS:
+        raise GnsError("--fillings is for --suite columns, friction, upscaled or all")
     if data is not None:
         _on_data(model, data, out, count, gradients, device, workers, as_json, quiet)
         return
@@ -103,13 +112,14 @@ def _by_suites(
     out: Path,
     spacing: float | None,
     budget: float,
-    fillings: int,
+    fillings: int | None,
     device: Device,
     workers: int,
     as_json: bool,
     quiet: bool,
 ) -> None:
     from gns_model.simulator import load_simulator
+    from gns_model.suites.fillings import can_refill
     from gns_model.suites.registry import chosen, run_suites
     from gns_model.suites.setup import Setup
 
@@ -118,6 +128,8 @@ def _by_suites(
     left_out = chosen(suite.value, simulator)[1]  # refuses what does not fit before any work
     for name, reason in left_out.items():
         print(f"left out: {name}: {reason}", file=sys.stderr)
+    if fillings is None:
+        fillings = FILLINGS if can_refill(simulator) else 0
     with console.progress_bar(quiet=quiet) as bar:
 
         def stage(description: str) -> Progress:

@@ -7,10 +7,9 @@ from itertools import pairwise
 
 from gns_model import paper
 from gns_model.simulator import Simulator
-from gns_model.suites import column_figures, fillings
-from gns_model.suites.collapse import collapse_row, runout_aims
-from gns_model.suites.fillings import filling_aims, filling_columns, simulate_fillings
-from gns_model.suites.pair import CLOSING, RUNOUTS, outside, simulate
+from gns_model.suites import column_figures
+from gns_model.suites.fillings import Starts
+from gns_model.suites.pair import CLOSING
 from gns_model.suites.result import Row, SuiteResult
 from gns_model.suites.setup import Setup
 
@@ -19,11 +18,9 @@ ASPECTS = (0.5, 1.0, 2.0)
 #: Twice as long as the paper's box [m], whose wall the flows of 15 and 22.5 degrees would reach.
 DOMAIN = (2.0, 0.5)
 
-SHOWN = (
+CASE = (
     ("friction_angle", "friction angle [°]", "g"),
     ("aspect", "a = H0/L0", "g"),
-    *RUNOUTS,
-    *CLOSING,
 )
 
 
@@ -49,17 +46,15 @@ def run(simulator: Simulator, setup: Setup) -> SuiteResult:
         )
         for angle, column in cases
     ]
-    pairs = simulate(simulator, scenes, setup)
-    others = simulate_fillings(simulator, scenes, setup)
+    starts = Starts.simulate(simulator, scenes, setup)
     rows: list[Row] = [
         {
             "friction_angle": angle,
             "aspect": column.aspect,
-            **collapse_row(pair),
-            **filling_columns(other),
+            **starts.row(k),
             **pair.facts(),
         }
-        for (angle, column), pair, other in zip(cases, pairs, others, strict=True)
+        for k, ((angle, column), pair) in enumerate(zip(cases, starts.pairs, strict=True))
     ]
     column_figures.runout_by_friction(rows, simulator.name, setup.out / "friction.png")
     reason = blind(simulator)
@@ -67,12 +62,9 @@ def run(simulator: Simulator, setup: Setup) -> SuiteResult:
         suite="friction",
         title=f"Normalised runout by friction angle: {simulator.name} beside our MPM",
         rows=rows,
-        warnings=outside(simulator, scenes),
-        shown=(*SHOWN[:2], *RUNOUTS, *fillings.SHOWN) if setup.fillings else SHOWN,
-        aims=[
-            *runout_aims(rows, pairs, "friction angles and aspect ratios"),
-            *filling_aims(rows, others, "friction angles and aspect ratios"),
-        ],
+        warnings=starts.warnings,
+        shown=(*CASE, *starts.shown(*CLOSING)),
+        aims=starts.aims(rows, "friction angles and aspect ratios"),
         facts={
             f"{key}_falls_with_friction": all(_falls(rows, aspect, key) for aspect in ASPECTS)
             for key in ("runout", "runout_mpm")

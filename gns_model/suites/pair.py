@@ -72,20 +72,23 @@ def simulate(
     scenes: Sequence[Scene],
     setup: Setup,
     *,
-    jitter: float = 0.0,
+    jitter: float | None = None,
     filling: int = 0,
 ) -> list[Pair]:
     """Run the simulator and, where it is not kept already, the reference on every scene.
 
     Args:
-        jitter, filling: of the reference, see `mpm.problem.Discretisation`; the simulator has its
-            own.
+        jitter, filling: of the reference, see `mpm.problem.Discretisation`; default: as the
+            simulator fills its own starts.
 
     Raises:
         SimulatorError, SceneError: if one of them cannot run a scene.
     """
     for scene in scenes:
         simulator.check(scene)
+    if jitter is None:
+        jitter = getattr(simulator, "jitter", 0.0)
+        filling = getattr(simulator, "filling", 0) if jitter else 0
     true = references(
         scenes,
         setup.out,
@@ -104,12 +107,12 @@ def simulate(
 
 def outside(simulator: Simulator, scenes: Sequence[Scene]) -> list[str]:
     """A sentence for every limit of the simulator's training that a scene passes, none repeated."""
-    limits = getattr(getattr(simulator, "config", None), "limits", None)
-    if limits is None:
+    broken = getattr(simulator, "outside", None)
+    if broken is None:
         return []
     first: dict[str, str] = {}
     for scene in scenes:
-        for line in limits.broken_by(scene):
+        for line in broken(scene):
             first.setdefault(line, scene.name)
     return [
         f"scene {name!r} is outside what {simulator.name} was trained on: {line}"

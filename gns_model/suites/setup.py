@@ -27,8 +27,7 @@ class Setup:
         threads: of the solver and of torch on the CPU where seconds are measured.
         devices: torch devices whose cost is measured.
         budget: about how long measuring the cost may take on each device [s].
-        fillings: how many starts off their lattice columns are run from beside the usual one; see
-            `fillings`.
+        fillings: how many other starts columns are run from beside the usual one; see `fillings`.
         stage: opens a progress bar; what it returns is called with the fraction done.
     """
 

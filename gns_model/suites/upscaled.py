@@ -5,15 +5,9 @@ from __future__ import annotations
 from gns_model import paper
 from gns_model.simulator import Simulator
 from gns_model.suites import column_figures, frames
-from gns_model.suites.collapse import collapse_curves, collapse_row, paper_columns
-from gns_model.suites.pair import (
-    CLOSING,
-    PAPERS_RUNOUTS,
-    RUNOUTS,
-    outside,
-    simulate,
-    squared_errors,
-)
+from gns_model.suites.collapse import collapse_curves, paper_columns
+from gns_model.suites.fillings import Starts
+from gns_model.suites.pair import CLOSING, PAPERS_RUNOUTS, squared_errors
 from gns_model.suites.result import Aim, Row, SuiteResult
 from gns_model.suites.setup import Setup
 
@@ -21,12 +15,9 @@ from gns_model.suites.setup import Setup
 DURATION = 1.25
 RUNOUT_AIM = 0.02
 
-SHOWN = (
+CASE = (
     ("case", "column", "s"),
     ("points", "points", "d"),
-    *RUNOUTS,
-    *PAPERS_RUNOUTS,
-    *CLOSING,
 )
 
 
@@ -43,17 +34,18 @@ def run(simulator: Simulator, setup: Setup) -> SuiteResult:
         paper.column_scene(large).replace(name="column-upscaled", duration=DURATION),
         paper.column_scene(small),
     ]
-    pairs = simulate(simulator, scenes, setup)
+    starts = Starts.simulate(simulator, scenes, setup)
+    pairs = starts.pairs
     rows: list[Row] = []
     curves = []
-    for (case, column), pair in zip(cases.items(), pairs, strict=True):
+    for k, ((case, column), pair) in enumerate(zip(cases.items(), pairs, strict=True)):
         rows.append(
             {
                 "case": case,
                 "aspect": column.aspect,
                 "height_0": column.height,
                 "length_0": column.length,
-                **collapse_row(pair),
+                **starts.row(k),
                 **paper_columns(column),
                 **pair.facts(),
             }
@@ -63,14 +55,15 @@ def run(simulator: Simulator, setup: Setup) -> SuiteResult:
     column_figures.upscaled(curves[0], curves[1], squared_errors(pairs[0]), pairs[0], name,
                             out / "upscaled.png")  # fmt: skip
     frames.collapse(pairs[0], name, out / "upscaled-frames.png")
-    error = abs(rows[0]["runout_error"]) if pairs[0].good else None
+    good = all(pair.good for pair in starts.fillings[0] or pairs[:1])
+    error = abs(rows[0][starts.key]) if good else None
     return SuiteResult(
         suite="upscaled",
         title=f"The up-scaled column: {name} beside our MPM and the paper",
         rows=rows,
-        warnings=outside(simulator, scenes),
-        shown=SHOWN,
-        aims=[Aim("runout error, up-scaled", error, RUNOUT_AIM)],
+        warnings=starts.warnings,
+        shown=(*CASE, *starts.shown(*PAPERS_RUNOUTS, *CLOSING)),
+        aims=[Aim(f"runout error, up-scaled{starts.judged}", error, RUNOUT_AIM)],
         facts={"mass_ratio": large.height * large.length / (small.height * small.length)},
         curves={"upscaled-curves": [row for curve in curves for row in curve]},
         files=["upscaled.png", "upscaled-frames.png"],

@@ -21,6 +21,10 @@ Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
 
 
+#: What of a model follows from the flows that it is trained on.
+FILLED_IN = {"model": {"limits", "jitter"}}
+
+
 class RecipeError(GnsError, ValueError):
     """A recipe that cannot be trained: the message names the key, the value and what is allowed."""
 
@@ -35,7 +39,7 @@ class Recipe(BaseModel):
 
     name: str = "model"
     #: Architecture and resolution. Its `noise_std` is the noise of the training, too; its
-    #: `limits` are filled in from the training scenes.
+    #: `limits` and `jitter` are filled in from the training flows.
     model: ModelConfig = ModelConfig()
 
     #: Begin with the weights of this model (shipped, or a checkpoint folder), not random ones.
@@ -156,9 +160,8 @@ class Recipe(BaseModel):
         return cls.from_dict(read_toml(Path(path), RecipeError), source=str(path))
 
     def to_toml(self, path: str | os.PathLike[str]) -> None:
-        """Write the recipe, as `from_toml` reads it; the limits, which training fills in, are not
-        a part of it."""
-        values = self.model_dump(mode="json", exclude_none=True, exclude={"model": {"limits"}})
+        """Write the recipe, as `from_toml` reads it, without what training fills in."""
+        values = self.model_dump(mode="json", exclude_none=True, exclude=FILLED_IN)
         write_whole(Path(path), toml_text(values).encode())
 
     @classmethod

@@ -165,8 +165,12 @@ def begin(recipe: Recipe, data: WindowIndex, state_file: Path, ranks: Ranks, res
         FileFormatError, RecipeError: as `train`.
     """
     torch.manual_seed(recipe.seed)
-    limits = Limits.of(source.scene for source in data.sources)
-    config = recipe.model.model_copy(update={"limits": limits})
+    known = {
+        "limits": Limits.of(source.scene for source in data.sources),
+        # Several subcells make starts of their own. 0 as soon as one flow is of a lattice.
+        "jitter": min(s.jitter for s in data.sources) if recipe.model.subcells == 1 else 0.0,
+    }
+    config = recipe.model.model_copy(update=known)
     model = LearnedModel(config).to(ranks.device)
     average = MovingAverage(model, recipe.ema_decay)
     optimiser = optimiser_of(recipe, model)

@@ -24,7 +24,7 @@ from gns_model.training.recipe import RecipeError
 #: What may differ between the two configurations: the weights do not depend on it, or, for the
 #: last four, `inherit` makes room.
 FREE = {
-    "noise_std", "subcells", "limits", "bounds", "solver_steps", "crowding_limit",
+    "noise_std", "subcells", "limits", "jitter", "bounds", "solver_steps", "crowding_limit",
     "material_features", "depth_range", "strain_unit", "history",
 }  # fmt: skip
 

@@ -57,6 +57,24 @@ def test_another_filling_is_the_solvers_too(simulator):
         LearnedSimulator(simulator.model, jitter=0.5)
 
 
+def test_a_model_starts_as_the_flows_did_that_it_was_trained_on(simulator, recwarn):
+    model = LearnedModel(simulator.config.model_copy(update={"jitter": 0.25}))
+    solver = MpmSimulator(spacing=SPACING, frame_interval=DT, jitter=0.25)
+    found = LearnedSimulator(model, "shaken").rollout([column()])[0]
+    solved = solver.rollout([column()])[0]
+    np.testing.assert_array_equal(found.positions[0], solved.positions[0])
+    assert found.settings["jitter"] == 0.25
+    assert not recwarn.list
+    lattice = LearnedSimulator(model, "shaken", jitter=0.0)
+    with pytest.warns(UserWarning, match="jitter = 0, but trained on starts moved by 0.25"):
+        lattice.check(column())
+    lattice.check(column())  # said once
+    with pytest.warns(UserWarning, match="jitter = 0.1, but trained on starts moved by 0 "):
+        simulator.refilled(0.1, 1).check(column())
+    assert not simulator.outside(column())
+    assert not any("jitter" in line for line in lattice.refilled(0.4, 2).outside(column()))
+
+
 def test_the_network_sees_the_solvers_motion(simulator):
     """Its first own step is one step from a history that ends with the solver's frames."""
     found = simulator.rollout([column()])[0].positions

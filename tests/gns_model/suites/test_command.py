@@ -70,7 +70,7 @@ def test_every_simulator_takes_the_options_of_the_command(model: str, device: st
 
 def test_tables_and_warnings_for_a_person(capsys, plane_model: Path, tmp_path: Path):
     arguments = ("--out", tmp_path, "--spacing", 0.06, "--workers", 1, "--quiet")
-    code, out, err = run(capsys, plane_model, "--suite", "upscaled", *arguments)
+    code, out, err = run(capsys, plane_model, "--suite", "upscaled", *arguments, "--fillings", 0)
     assert code == 0, err
     assert "The up-scaled column: plane-model beside our MPM and the paper" in out
     assert "MISSED  runout error, up-scaled" in out
@@ -78,6 +78,14 @@ def test_tables_and_warnings_for_a_person(capsys, plane_model: Path, tmp_path: P
     (warning,) = (line for line in err.splitlines() if line.startswith("warning: "))
     assert "'column-upscaled' is outside what plane-model was trained on" in warning
     assert "release_height = 0.36" in warning
+
+
+def test_means_of_eight_fillings_are_judged(capsys, plane_model: Path, tmp_path: Path):
+    arguments = ("--out", tmp_path, "--spacing", 0.12, "--workers", 1, "--quiet")
+    code, out, err = run(capsys, plane_model, "--suite", "upscaled", *arguments)
+    assert code == 0, err
+    assert "up-scaled, means of 8 fillings: " in out
+    assert "jitter = 0.25, but trained on starts moved by 0 spacings" in err
 
 
 @pytest.mark.parametrize(

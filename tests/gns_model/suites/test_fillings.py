@@ -1,4 +1,4 @@
-"""Columns from starts off their lattice, both simulators from the same points."""
+"""Columns from several fillings, both simulators from the same points."""
 
 from pathlib import Path
 
@@ -8,8 +8,8 @@ import pytest
 from gns_model import measures, paper
 from gns_model.errors import SimulatorError
 from gns_model.mpm import MpmSimulator
-from gns_model.suites import columns, fillings, friction
-from gns_model.suites.fillings import JITTER, filling_columns, simulate_fillings
+from gns_model.suites import columns, fillings, friction, upscaled
+from gns_model.suites.fillings import JITTER, Starts, can_refill, filling_columns
 from gns_model.suites.setup import Setup
 
 SPACING = 0.05
@@ -19,8 +19,9 @@ COLUMN = paper.column_scene(paper.COLUMNS[2]).replace(duration=0.4)
 def test_runouts_are_means_over_the_fillings(tiny, shared: Path):
     simulator = tiny(solver_steps=2)
     setup = Setup(shared, spacing=SPACING, fillings=3)
-    [pairs] = simulate_fillings(simulator, [COLUMN], setup)
-    row = filling_columns(pairs)
+    starts = Starts.simulate(simulator, [COLUMN], setup)
+    [pairs] = starts.fillings
+    row = starts.row(0)
     solved, learned = [], []
     for k in (1, 2, 3):
         solver = MpmSimulator(spacing=SPACING, frame_interval=0.02, jitter=JITTER, filling=k)
@@ -41,9 +42,13 @@ def test_runouts_are_means_over_the_fillings(tiny, shared: Path):
     for pair in pairs:  # from the same points
         np.testing.assert_array_equal(pair.predicted.positions[0], pair.reference.positions[0])
     assert simulator.jitter == 0.0  # the one that was given is as it was
+    # What is judged are the means, of which a model of lattices is told that it never saw any.
+    aims = starts.aims([row], "one column")
+    assert [aim.value for aim in aims] == [pytest.approx(abs(row["fillings_error"]))] * 2
+    assert any("jitter = 0.25, but trained on" in line for line in starts.warnings)
 
 
-@pytest.mark.parametrize("suite", [columns, friction])
+@pytest.mark.parametrize("suite", [columns, friction, upscaled])
 def test_the_solver_agrees_with_itself_from_every_filling(
     suite, shared: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -56,26 +61,46 @@ def test_the_solver_agrees_with_itself_from_every_filling(
         assert row["fillings_error"] == 0.0
         assert row["fillings_mpm_sd"] > 0
         assert row["fillings_mpm"] != row["runout_mpm"]
-    assert [aim.met for aim in result.aims] == [True] * 4
-    assert "2 fillings" in result.aims[2].name
-    assert result.shown[-len(fillings.SHOWN) :] == fillings.SHOWN
-    assert len(result.cells()[0]) == len(result.shown) < len(suite.SHOWN) + len(fillings.SHOWN)
-    # Without, the table is as it was.
+    assert all(aim.met for aim in result.aims)
+    assert all("means of 2 fillings" in aim.name for aim in result.aims)
+    assert set(fillings.SHOWN) < set(result.shown)
+    assert result.warnings == []
+    # Without, one start is judged, and there is room for more columns.
     usual = suite.run(solver, Setup(shared, spacing=SPACING))
-    assert len(usual.aims) == 2
+    assert len(usual.aims) == len(result.aims)
+    assert not any("fillings" in aim.name for aim in usual.aims)
+    assert not set(fillings.SHOWN) & set(usual.shown)
     assert "fillings" not in usual.rows[0]
+
+
+def test_a_model_of_shaken_starts_is_held_against_the_same_start(tiny, shared: Path):
+    simulator = tiny(solver_steps=2, jitter=0.25)
+    starts = Starts.simulate(simulator, [COLUMN], Setup(shared, spacing=SPACING, fillings=1))
+    (pair,) = starts.pairs
+    np.testing.assert_array_equal(pair.predicted.positions[0], pair.reference.positions[0])
+    solver = MpmSimulator(spacing=SPACING, jitter=0.25)
+    expected = solver.rollout([COLUMN.replace(duration=0.02)])[0].positions[0]
+    np.testing.assert_array_equal(pair.reference.positions[0], expected)
+    assert not any("jitter" in line for line in starts.warnings)
 
 
 def test_one_filling_has_no_deviation(shared: Path):
     setup = Setup(shared, spacing=SPACING, fillings=1)
-    [pairs] = simulate_fillings(MpmSimulator(spacing=SPACING), [COLUMN], setup)
-    assert filling_columns(pairs)["fillings_mpm_sd"] is None
+    starts = Starts.simulate(MpmSimulator(spacing=SPACING), [COLUMN], setup)
+    assert filling_columns(starts.fillings[0])["fillings_mpm_sd"] is None
 
 
 def test_a_simulator_of_ones_own_may_know_no_fillings(shared: Path):
     class Own:
         name = "own"
 
+        def __init__(self) -> None:
+            self.solver = MpmSimulator(spacing=SPACING)
+            self.check, self.rollout = self.solver.check, self.solver.rollout
+
+    assert not can_refill(Own())
     with pytest.raises(SimulatorError, match="own cannot start from another filling"):
-        simulate_fillings(Own(), [COLUMN], Setup(shared, fillings=2))
-    assert simulate_fillings(Own(), [COLUMN], Setup(shared)) == [()]
+        Starts.simulate(Own(), [COLUMN], Setup(shared, spacing=SPACING, fillings=2))
+    starts = Starts.simulate(Own(), [COLUMN], Setup(shared, spacing=SPACING))
+    assert starts.count == 0
+    assert starts.row(0)["runout_error"] == 0.0

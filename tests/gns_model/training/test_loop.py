@@ -15,6 +15,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from gns_model.data.generate import generate
 from gns_model.data.windows import WindowIndex
 from gns_model.errors import FileFormatError
 from gns_model.learned.checkpoint import load_model
@@ -54,6 +55,26 @@ def test_a_run_leaves_a_simulator_that_runs(tiny, tmp_path, slides):
     key = "network.decode.layers.0.weight"
     assert torch.equal(last[key], state[f"average.{key}"])
     assert not torch.equal(last[key], state[f"model.{key}"])
+
+
+def test_a_model_starts_as_the_flows_that_it_learned_from(tiny, tmp_path):
+    for name, jitter in (("lattice", 0.0), ("shaken", 0.3)):
+        generate(
+            tmp_path / name, family="columns", count=1, spacing=0.05, frame_interval=0.02,
+            jitter=jitter, workers=1,
+        )  # fmt: skip
+    chosen = {"dim": 2, "spacing": 0.05, "radius": 0.08}
+    values = {**tiny, "steps": 1, "valid": [], "model": {**tiny["model"], **chosen}}
+
+    def trained(*folders: str, **options: int) -> float:
+        wanted = {"train": [str(tmp_path / f) for f in folders]}
+        model = {**values["model"], **options}
+        recipe = Recipe.from_dict({**values, **wanted, "model": model})
+        return load_model(train(recipe, tmp_path / "-".join([*folders, *options]))).jitter
+
+    assert trained("shaken") == 0.3
+    assert trained("lattice") == trained("shaken", "lattice") == 0.0
+    assert trained("shaken", subcells=2) == 0.0  # its starts are drawn in another way
 
 
 def test_training_learns_a_law_of_motion(tiny, tmp_path):
