@@ -31,7 +31,7 @@ from gns_model import measures
 from gns_model.errors import SimulatorError
 from gns_model.files import write_whole
 from gns_model.scene import Scene
-from gns_model.simulator import Progress, Simulator
+from gns_model.simulator import Progress, Simulator, can_refill
 from gns_model.trajectory import OK, Trajectory
 
 #: The measures that are judged, and the least denominator of their relative error: below it a
@@ -246,6 +246,8 @@ def compare(
 ) -> Comparison:
     """Roll `simulator` out on the scenes of `references` and set the two side by side.
 
+    A simulator that can start from other fillings (`refilled`) starts from that of each reference.
+
     Args:
         simulator: what is judged.
         references: trajectories of the reference, one a scene.
@@ -264,7 +266,7 @@ def compare(
     for start in range(0, len(scenes), batch):
         chunk = references[start : start + batch]
         began = time.perf_counter()
-        predictions = simulator.rollout([r.scene for r in chunk])
+        predictions = _from_the_same_starts(simulator, chunk)
         seconds = (time.perf_counter() - began) / len(chunk)
         for prediction, reference in zip(predictions, chunk, strict=True):
             results.append(_result(prediction, reference, seconds))
@@ -273,6 +275,22 @@ def compare(
     return Comparison(
         simulator=simulator.name, reference=references[0].simulator, results=tuple(results)
     )
+
+
+def _from_the_same_starts(
+    simulator: Simulator, references: Sequence[Trajectory]
+) -> list[Trajectory]:
+    """Rollouts of the scenes of `references`, together where their fillings are the simulator's."""
+    own = getattr(simulator, "jitter", 0.0), getattr(simulator, "filling", 0)
+    starts = [
+        (float(r.settings.get("jitter", 0)), r.settings.get("filling", 0)) for r in references
+    ]
+    if not can_refill(simulator) or all(s == own or s[0] == own[0] == 0 for s in starts):
+        return simulator.rollout([r.scene for r in references])
+    predictions = []
+    for reference, start in zip(references, starts, strict=True):
+        predictions += simulator.refilled(*start).rollout([reference.scene])
+    return predictions
 
 
 def _result(prediction: Trajectory, reference: Trajectory, seconds: float) -> SceneResult:

@@ -6,7 +6,7 @@ import inspect
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeGuard, runtime_checkable
 
 from gns_model.errors import SimulatorError
 from gns_model.scene import Scene
@@ -31,6 +31,18 @@ class Simulator(Protocol):
     def check(self, scene: Scene) -> None:
         """Raise SimulatorError if this simulator cannot run `scene`."""
         ...
+
+
+class Refillable(Simulator, Protocol):
+    """A simulator that can start from other fillings."""
+
+    def refilled(self, jitter: float, filling: int) -> Simulator:
+        """The same from points `shaken` so (`gns_model.particles`)."""
+
+
+def can_refill(simulator: Simulator) -> TypeGuard[Refillable]:
+    """Whether it can start from other fillings; a simulator of one's own need not."""
+    return hasattr(simulator, "refilled")
 
 
 def load_simulator(name: str | os.PathLike[str], device: str = "cpu", **options: Any) -> Simulator:

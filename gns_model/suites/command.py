@@ -118,8 +118,7 @@ def _by_suites(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    from gns_model.simulator import load_simulator
-    from gns_model.suites.fillings import can_refill
+    from gns_model.simulator import can_refill, load_simulator
     from gns_model.suites.registry import chosen, run_suites
     from gns_model.suites.setup import Setup
 

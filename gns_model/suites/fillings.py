@@ -11,14 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeGuard
 
 import numpy as np
 
 from gns_model import measures
 from gns_model.errors import SimulatorError
 from gns_model.scene import Scene
-from gns_model.simulator import Simulator
+from gns_model.simulator import Simulator, can_refill
 from gns_model.suites.collapse import collapse_row, runout_aims
 from gns_model.suites.pair import RUNOUTS, Pair, outside, relative, simulate
 from gns_model.suites.result import Aim, Row
@@ -107,18 +106,6 @@ class Starts:
         """The aims of the runouts in `rows`."""
         pairs = [pair for some in self.fillings for pair in some] or self.pairs
         return runout_aims(rows, pairs, f"{over}{self.judged}", self.key)
-
-
-class Refillable(Simulator, Protocol):
-    """A simulator that can start from other fillings."""
-
-    def refilled(self, jitter: float, filling: int) -> Simulator:
-        """The same from points `shaken` so (`gns_model.particles`)."""
-
-
-def can_refill(simulator: Simulator) -> TypeGuard[Refillable]:
-    """Whether it can start from other fillings; a simulator of one's own need not."""
-    return hasattr(simulator, "refilled")
 
 
 def filling_columns(pairs: Sequence[Pair]) -> Row:

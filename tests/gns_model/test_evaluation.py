@@ -193,6 +193,15 @@ def test_a_coarser_filling_can_be_judged(references):
     assert 0 < numbers["deposit_error"] < 1
 
 
+def test_rollouts_start_where_their_references_did(plane_scene: Scene):
+    """Each from its own filling, be it of a lattice or not, whatever the simulator would choose."""
+    shaken = [MpmSimulator(spacing=0.05, jitter=0.3, filling=k) for k in (1, 2)]
+    solvers = [*shaken, MpmSimulator(spacing=0.05)]
+    references = [solver.rollout([plane_scene])[0] for solver in solvers]
+    comparison = compare(MpmSimulator(spacing=0.05), references, batch=2)
+    assert [result.point_rmse for result in comparison.results] == [0.0] * 3
+
+
 def test_one_scene_defines_errors_and_no_slope(references):
     numbers = compare(Slide(1.1), references[:1]).aggregate()
     assert numbers["centroid_travel.error"] == pytest.approx(0.1)

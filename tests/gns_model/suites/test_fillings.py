@@ -8,8 +8,9 @@ import pytest
 from gns_model import measures, paper
 from gns_model.errors import SimulatorError
 from gns_model.mpm import MpmSimulator
+from gns_model.simulator import can_refill
 from gns_model.suites import columns, fillings, friction, upscaled
-from gns_model.suites.fillings import JITTER, Starts, can_refill, filling_columns
+from gns_model.suites.fillings import JITTER, Starts, filling_columns
 from gns_model.suites.setup import Setup
 
 SPACING = 0.05
