@@ -66,7 +66,7 @@ def runout_by_aspect(rows: Sequence[Row], name: str, path: Path) -> None:
     if spread is not None:
         left.errorbar(
             aspect, solved, spread, fmt="none", color=OURS, capsize=3, linewidth=1,
-            label="its deviation over fillings",
+            label="our MPM over fillings (deviation)",
         )  # fmt: skip
     left.set(
         xscale="log", yscale="log", xlabel=ASPECT,
