@@ -84,7 +84,10 @@ def main() -> None:
         history = max(config.history, 2)  # the step before is told from two velocities
         scenes = [paper.column_scene(c) for c in paper.COLUMNS] if flat else [paper.flume_scene()]
         spacing = config.spacing / config.subcells
-        solver = load_simulator("mpm", spacing=spacing, frame_interval=config.dt)
+        # From the points that the model would start from; several subcells draw their own.
+        solver = load_simulator(
+            "mpm", spacing=spacing, frame_interval=config.dt, jitter=simulator.jitter
+        )
         total = np.zeros((len(TIMES) - 1, 5))
         with tempfile.TemporaryDirectory() as folder:
             for k, scene in enumerate(scenes):

@@ -77,7 +77,10 @@ def main() -> None:
         if not isinstance(simulator, LearnedSimulator) or simulator.config.dim != 2:
             parser.error(f"{name}: not a learned simulator of 2D columns")
         config = simulator.config
-        solver = load_simulator("mpm", spacing=config.spacing, frame_interval=config.dt, threads=1)
+        start = {"jitter": simulator.jitter, "filling": simulator.filling}
+        solver = load_simulator(
+            "mpm", spacing=config.spacing, frame_interval=config.dt, threads=1, **start
+        )
         rows = []
         for column in paper.COLUMNS:
             scene = paper.column_scene(column).replace(duration=UNTIL + config.dt)
