@@ -246,7 +246,8 @@ def compare(
 ) -> Comparison:
     """Roll `simulator` out on the scenes of `references` and set the two side by side.
 
-    A simulator that can start from other fillings (`refilled`) starts from that of each reference.
+    A simulator that can start from other fillings (`refilled`) starts from that of each reference,
+    if its points are as far apart.
 
     Args:
         simulator: what is judged.
@@ -280,12 +281,20 @@ def compare(
 def _from_the_same_starts(
     simulator: Simulator, references: Sequence[Trajectory]
 ) -> list[Trajectory]:
-    """Rollouts of the scenes of `references`, together where their fillings are the simulator's."""
+    """Rollouts of the scenes of `references`, together where their fillings are the simulator's.
+
+    A model of another spacing has other points, whose lattice is not theirs: it starts as it does.
+    """
     own = getattr(simulator, "jitter", 0.0), getattr(simulator, "filling", 0)
     starts = [
         (float(r.settings.get("jitter", 0)), r.settings.get("filling", 0)) for r in references
     ]
-    if not can_refill(simulator) or all(s == own or s[0] == own[0] == 0 for s in starts):
+    config = getattr(simulator, "config", None)
+    alike = config is None or all(
+        math.isclose(r.point_volume, config.spacing**config.dim, rel_tol=1e-6) for r in references
+    )
+    usual = all(s == own or s[0] == own[0] == 0 for s in starts)
+    if usual or not alike or not can_refill(simulator):
         return simulator.rollout([r.scene for r in references])
     predictions = []
     for reference, start in zip(references, starts, strict=True):

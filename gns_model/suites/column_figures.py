@@ -81,7 +81,8 @@ def runout_by_aspect(rows: Sequence[Row], name: str, path: Path) -> None:
     left.legend(frameon=False)
 
     place = np.arange(len(rows))
-    ours, theirs = 100 * (learned / solved - 1), 100 * curve(rows, "paper_error")
+    judged = "fillings_error" if "fillings" in rows[0] else "runout_error"
+    ours, theirs = 100 * curve(rows, judged), 100 * curve(rows, "paper_error")
     right.axhspan(-100 * RUNOUT_AIM, 100 * RUNOUT_AIM, color="0.93")
     right.axhline(0, color="0.4", linewidth=0.8)
     right.bar(place - 0.2, ours, 0.38, color=LEARNED, label=f"{name} against our MPM")

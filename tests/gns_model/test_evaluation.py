@@ -202,6 +202,19 @@ def test_rollouts_start_where_their_references_did(plane_scene: Scene):
     assert [result.point_rmse for result in comparison.results] == [0.0] * 3
 
 
+@pytest.mark.parametrize(("spacing", "jitter"), [(0.05, 0.3), (0.1, 0.0)])
+def test_a_model_starts_likewise_if_its_points_are_as_far_apart(plane_scene, spacing, jitter):
+    scene = plane_scene.with_baffles([])
+    [reference] = MpmSimulator(spacing=0.05, jitter=0.3, filling=1).rollout([scene])
+    config = ModelConfig(
+        dim=2, spacing=spacing, radius=0.15, dt=0.02, history=1, latent=8, blocks=1, solver_steps=1
+    )
+    simulator = LearnedSimulator(LearnedModel(config))
+    expected = simulator.refilled(jitter, 1).rollout([scene])[0]
+    [result] = compare(simulator, [reference]).results
+    assert result.point_rmse == pytest.approx(point_rmse(expected, reference), rel=1e-6)
+
+
 def test_one_scene_defines_errors_and_no_slope(references):
     numbers = compare(Slide(1.1), references[:1]).aggregate()
     assert numbers["centroid_travel.error"] == pytest.approx(0.1)
