@@ -174,8 +174,8 @@ class ModelConfig(BaseModel):
     solver_steps: Annotated[int, Field(ge=0)] = 0
 
     #: How far the points of a start are moved off their lattice, in spacings: as in the flows that
-    #: it was trained on, from which training fills this in. Flows of a lattice and flows of
-    #: shaken points differ in more than their start: a model of one kind runs off on the other.
+    #: it was trained on, from which training fills this in. The farthest grain of a lattice
+    #: stops short of that of shaken points; what a model does on one tells little of the other.
     jitter: Annotated[float, Field(ge=0, lt=0.5)] = 0.0
 
     types: Annotated[int, Field(ge=0)] = 0  #: number of particle types to embed; 0: none
