@@ -55,6 +55,7 @@ class Family(StrEnum):
     bare = "bare"
     rows = "rows"
     rectangles_friction = "rectangles-friction"
+    slides = "slides"
 
 
 @app.command()

@@ -45,6 +45,35 @@ def barrier_scene(rng: np.random.Generator, index: int) -> Scene:
     )
 
 
+def slide_scene(rng: np.random.Generator, index: int) -> Scene:
+    """A scene of the family "slides". Most come to rest before the far wall."""
+    low, length, width = 0.1, 1.4, 0.8
+    size = (rng.uniform(0.14, 0.36), rng.uniform(0.1, 0.3), rng.uniform(0.2, 0.6))
+    start = (
+        low + (rng.uniform(0, 0.1) if rng.random() < 0.5 else 0.0),
+        low,
+        low + rng.uniform(0, width - size[2]),
+    )
+    return _with_random_baffles(
+        {
+            "name": "slides",
+            "domain": {"lower": (low,) * 3, "upper": (low + length, 0.9, low + width)},
+            "release": [
+                {
+                    "lower": start,
+                    "upper": tuple(a + b for a, b in zip(start, size, strict=True)),
+                    "velocity": (rng.uniform(0.8, 2.6), 0.0, rng.normal(0, 0.1)),
+                }
+            ],
+            "duration": 0.87,
+        },
+        rng,
+        count=int(rng.integers(0, 3)),
+        size=lambda: (rng.uniform(0.1, 0.2), 0.3, rng.uniform(0.1, 0.2)),
+        gap=0.05,
+    )
+
+
 def random_scene(rng: np.random.Generator, index: int) -> Scene:
     """A scene of the family "random"."""
     length, width = rng.uniform(0.8, 1.8), rng.uniform(0.5, 1.8)

@@ -102,3 +102,18 @@ def test_rows_are_tight_and_straight():
             assert np.ptp(x) <= 0.04
             assert z[0] - row[0].size[2] / 2 >= 0.1 - 1e-9  # within the walls
             assert z[-1] + row[0].size[2] / 2 <= 1.9 + 1e-9
+
+
+def test_slides_start_on_the_base_and_have_room_before_the_far_wall():
+    scenes = [draw("slides", 0, k) for k in range(60)]
+    for scene in scenes:
+        (block,) = scene.releases
+        lower, upper, size = map(np.asarray, (block.lower, block.upper, block.size))
+        assert (lower >= np.array(scene.domain.lower) - 1e-9).all()
+        assert (upper <= np.array(scene.domain.upper) + 1e-9).all()
+        assert lower[1] == scene.domain.lower[1]
+        assert 0.1 <= size[1] <= 0.3
+        assert scene.domain.upper[0] - upper[0] > 0.9
+        for baffle in scene.baffles:
+            assert baffle.center[0] - baffle.size[0] / 2 > upper[0]
+    assert {len(scene.baffles) for scene in scenes} == {0, 1, 2}

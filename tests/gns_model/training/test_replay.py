@@ -217,3 +217,29 @@ def test_a_recipe_with_fewer_flows_goes_on_with_the_first_of_them(flight, tmp_pa
 def test_replay_needs_a_way_back(tiny):
     with pytest.raises(RecipeError, match="return_steps"):
         Recipe.from_dict({**tiny, "replay": 4})
+
+
+def test_flows_of_other_data_begin_again(flight, free_scene, tmp_path):
+    """Their numbers may fit, and even their points: the flow that a number means is another."""
+    replay, net = remembering(flight, 4), flight[3]
+    for step in range(3):
+        advance(replay, net, step)
+        replay.keep()
+    replay.save(tmp_path, 3)
+    recipe, _, statistics, _ = flight
+
+    def restored(gravity: float) -> Replay:
+        folder = tmp_path / f"{gravity:.0f}"
+        scene = free_scene.replace(gravity=(0.0, gravity, 0.0))
+        trajectory(scene, fly, 11).save(folder / "flight.h5")
+        with session("cpu") as ranks:
+            wished = recipe.model_copy(update={"replay_memory": 4})
+            other = Replay(open_data(recipe, [str(folder)]), wished, statistics, ranks)
+        other.restore(tmp_path, 3)
+        return other
+
+    moved, changed = restored(0.0), restored(-9.81)
+    assert len(moved.flows) == len(replay.flows), "where files are kept is no matter"
+    assert len(moved.memories) == len(replay.memories) > 0
+    assert (changed.flows, changed.memories) == ([], [])
+    assert np.isfinite(advance(changed, net, 3))
