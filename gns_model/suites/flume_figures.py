@@ -29,7 +29,7 @@ def evolution(rows: Sequence[Row], pair: Pair, name: str, path: Path) -> None:
     top = max(box[1, 1] for box in pair.scene.baffle_boxes()) - pair.scene.base
     deep.axhline(top, color="0.5", linewidth=0.8)
     deep.text(0.0, top, " height of the baffles", va="bottom", color="0.4", fontsize=9)
-    deep.set(ylabel="depth upstream of a row [m]", ylim=(0, 1.15 * top))
+    deep.set(ylabel="depth upstream of a row [m]", ylim=(0, max(1.15 * top, deep.get_ylim()[1])))
     energy_panel(energy, rows, curve(rows, "time"), name, legend=True)
     _lines(held, rows, {"held_back": "upstream minus downstream"}, name)
     held.set(ylabel=r"$(E_p + E_k)/E_0$ held back by the baffles")
