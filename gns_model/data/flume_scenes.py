@@ -47,13 +47,18 @@ def barrier_scene(rng: np.random.Generator, index: int) -> Scene:
 
 def slide_scene(rng: np.random.Generator, index: int) -> Scene:
     """A scene of the family "slides". Most come to rest before the far wall."""
-    low, length, width = 0.1, 1.4, 0.8
-    size = (rng.uniform(0.14, 0.36), rng.uniform(0.1, 0.3), rng.uniform(0.2, 0.6))
+    low = 0.1
+    size = [rng.uniform(0.14, 0.36), rng.uniform(0.1, 0.3), rng.uniform(0.2, 0.6)]
+    channel = rng.random() < 0.5
+    if channel:  # as in the middle of a wide release, nothing gives way sideways
+        size[2] = rng.uniform(0.15, 0.45)
+    length, width = (1.8, size[2]) if channel else (1.4, 0.8)
     start = (
         low + (rng.uniform(0, 0.1) if rng.random() < 0.5 else 0.0),
         low,
         low + rng.uniform(0, width - size[2]),
     )
+    widest = 0.6 * width if channel else 0.2
     return _with_random_baffles(
         {
             "name": "slides",
@@ -69,7 +74,7 @@ def slide_scene(rng: np.random.Generator, index: int) -> Scene:
         },
         rng,
         count=int(rng.integers(0, 3)),
-        size=lambda: (rng.uniform(0.1, 0.2), 0.3, rng.uniform(0.1, 0.2)),
+        size=lambda: (rng.uniform(0.1, 0.2), 0.3, rng.uniform(widest / 2, widest)),
         gap=0.05,
     )
 

@@ -7,8 +7,8 @@ The paper's three datasets (table "Training data"), with what its columns and it
                 turn
     barriers    3D: a cube of 0.2 to 0.4 m at a random place and velocity in a box of 0.8 m, with
                 one or two barriers of 0.1 x 0.3 x 0.1 m
-    slides      3D: a block of 0.1 to 0.3 m height that slides along the base of a box of 1.4 m,
-                with up to two barriers in its way
+    slides      3D: a block of 0.1 to 0.3 m height that slides along the base of a box of 1.4 m, or
+                fills a channel of 0.15 to 0.45 m, with up to two barriers in its way
     rectangles  2D: a rectangle at rest against a wall, of random aspect: the paper's validation
     rectangles-friction
                 2D: a rectangle of 0.03 to 0.10 m2 and aspect 0.4 to 2.5 at rest against a wall, at
