@@ -2,7 +2,7 @@
 PYTHON ?= python3
 PY := .venv/bin/python
 RUN ?= runs/flume
-# One thread a process: several one-thread processes beat threads here (findings in README).
+# One thread a process: several one-thread processes beat threads here (docs/accuracy.md).
 export OMP_NUM_THREADS ?= 1
 
 .PHONY: demo test lint benchmarks clean
