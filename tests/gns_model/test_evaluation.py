@@ -417,7 +417,7 @@ def test_the_gradient_of_an_untrained_net_is_checked_too(small_flume: Scene):
 @pytest.mark.parametrize("name", ["baffle-lite"])  # the one that layouts are chosen with
 def test_a_shipped_model_knows_which_way_to_move_a_baffle(name: str, flume: Scene):
     """Over the whole flow; the paper's way of baffles had a cosine of -0.6 here, and our own exact
-    gradient 0.26. Measured: 0.78. The aim of 0.9 is not met yet: docs/layouts.md says by how much."""
+    gradient 0.26. Measured: 0.78. The aim of 0.9 is not met yet (docs/layouts.md)."""
     simulator = load_simulator(name)
     layout = flume.with_baffles([[0.775, 0.5], [0.80, 1.4], [1.2, 0.95]])
     check = gradient_check(simulator, layout)

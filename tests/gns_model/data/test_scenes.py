@@ -117,7 +117,8 @@ def test_slides_start_on_the_base_and_have_room_before_the_far_wall():
         for baffle in scene.baffles:
             assert baffle.center[0] - baffle.size[0] / 2 > upper[0]
     assert {len(scene.baffles) for scene in scenes} == {0, 1, 2}
-    fills = [s.releases[0].size[2] > 0.999 * (s.domain.upper[2] - s.domain.lower[2]) for s in scenes]
+    widths = [scene.domain.upper[2] - scene.domain.lower[2] for scene in scenes]
+    fills = [s.releases[0].size[2] > 0.999 * w for s, w in zip(scenes, widths, strict=True)]
     assert 15 < sum(fills) < 45
     for scene in (s for s, full in zip(scenes, fills, strict=True) if full):
         for baffle in scene.baffles:  # which leave a way past
