@@ -51,7 +51,12 @@ td{text-align:right;padding:9px 0 9px 18px;border-top:1px solid var(--line);whit
 th:first-child,td:first-child{text-align:left;padding-left:0;white-space:normal}
 td small{display:block;font-size:12.5px;line-height:1.4;max-width:46ch}
 td.text,th.text{text-align:left;white-space:normal}
-.scroll{overflow-x:auto}
+/* A table that is wider than its card fades out where more of it is to be scrolled to. */
+.scroll{overflow-x:auto;background:
+ linear-gradient(90deg,var(--paper) 40%,transparent) left/36px 100% no-repeat local,
+ linear-gradient(270deg,var(--paper) 40%,transparent) right/36px 100% no-repeat local,
+ linear-gradient(90deg,var(--line),transparent) left/14px 100% no-repeat,
+ linear-gradient(270deg,var(--line),transparent) right/14px 100% no-repeat}
 .key{font-weight:650}
 .better{color:var(--good);font-weight:600}.worse{color:var(--bad);font-weight:600}
 .same{color:var(--muted)}
@@ -99,19 +104,20 @@ pre{background:var(--ground);border:1px solid var(--line);border-radius:8px;padd
  white-space:pre-wrap;overflow-wrap:anywhere}
 .columns{display:grid;grid-template-columns:repeat(auto-fit,minmax(290px,1fr));gap:16px}
 .columns table{font-size:13.5px}.columns td{padding:6px 0 6px 14px;overflow-wrap:anywhere;
- white-space:normal}.columns td:first-child{color:var(--muted);padding-left:0}
+ white-space:normal}.columns td:first-child{color:var(--muted);padding-left:0;white-space:nowrap}
 .note{border-left:3px solid var(--bad);padding:2px 0 2px 16px;margin:22px 0 0}
 .note p{margin:6px 0 0}.note ul{margin:4px 0 0;padding-left:18px}
 footer{margin-top:56px;color:var(--muted);font-size:13px}
 @media(max-width:820px){.answer{grid-template-columns:1fr}main{padding:28px 16px 48px}
- .card{padding:16px}}
+ .card{padding:16px}.scroll td:first-child:not(:has(svg)){min-width:9.5em}}
 """
 
 PRINT = """
 @page{size:A4;margin:14mm}
-@media print{body{background:#fff;font-size:11.5px}main{max-width:none;padding:0}
+/* Sizes are those of a screen; smaller by a third, its columns fit on paper. */
+@media print{body{background:#fff}main{max-width:none;padding:0;zoom:.66}
  .card,.tile{border-color:#d8d4cc}section{margin-top:26px}.film,.flow{display:none}
- .card,.tile,figure,tr{break-inside:avoid}h2,h2+p{break-after:avoid}
+ .card,.tile,figure,tr,p{break-inside:avoid}h2,h2+p{break-after:avoid}.scroll{background:none}
  .answer{grid-template-columns:1.2fr 1fr}a{color:inherit;text-decoration:none}}
 """
 

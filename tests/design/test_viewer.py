@@ -175,3 +175,40 @@ def test_plane_strain_in_a_browser(tmp_path, browser):
     )
     assert sand > 500
     browser.picture(tmp_path / "view.png")
+
+
+WIDER = """[...document.querySelectorAll(".scroll, main")]
+  .filter(e => e.scrollWidth > e.clientWidth + 1).length"""
+
+
+@pytest.fixture
+def screen(browser):
+    """Shows the page as wide as asked for, on screen or printed; as before when done."""
+
+    def show(width, media="screen"):
+        browser.call("Emulation.setEmulatedMedia", media=media)
+        browser.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width, height=900, deviceScaleFactor=1, mobile=False,
+        )  # fmt: skip
+
+    yield show
+    browser.call("Emulation.setEmulatedMedia", media="")
+    browser.call("Emulation.clearDeviceMetricsOverride")
+
+
+def test_a_printed_page_shows_its_tables_whole(page, browser, screen):
+    """A4 less its margins is 182 mm: 688 pixels of CSS. On paper nothing can be scrolled to."""
+    browser.open(page)
+    assert browser.run('document.querySelectorAll("main table").length') > 4
+    screen(688, "print")
+    assert browser.run(WIDER) == 0
+    answer = browser.run('document.querySelector(".answer").getBoundingClientRect().bottom')
+    assert answer < 0.9 * 688 * (297 - 28) / 182  # where the baffles go is on the first sheet
+
+
+def test_on_a_phone_only_tables_are_wider_than_the_screen(page, browser, screen):
+    browser.open(page)
+    screen(390)
+    assert browser.run("document.documentElement.scrollWidth") <= 390
+    assert browser.run(WIDER) > 0  # they scroll within their cards
