@@ -22,10 +22,10 @@ from gns_model.learned.model import LearnedModel
 from gns_model.training.recipe import RecipeError
 
 #: What may differ between the two configurations: the weights do not depend on it, or, for the
-#: last four, `inherit` makes room.
+#: last five, `inherit` makes room.
 FREE = {
     "noise_std", "subcells", "limits", "jitter", "bounds", "solver_steps", "crowding_limit",
-    "material_features", "depth_range", "strain_unit", "history",
+    "material_features", "depth_range", "strain_unit", "history", "blocks",
 }  # fmt: skip
 
 #: What is as long as the scale. What strain and depth are measured in does not grow with it.
@@ -35,6 +35,7 @@ LENGTHS = ("spacing", "radius", "wall_range", "baffle_range")
 STRIDE_TOLERANCE = 0.1
 
 _FIRST = "network.encode_{}.layers.0.weight"
+_BLOCK = "network.blocks."
 
 
 @torch.no_grad()
@@ -45,7 +46,9 @@ def inherit(model: LearnedModel, start_from: str) -> None:
     zero: it begins by ignoring them, and moves points exactly as its parent does, or, if its
     lengths are λ times the parent's, as the parent does a flow of that scale. Where its history is
     the shorter one, it begins as if every point had always moved as in the first velocity that it
-    sees. A `crowding_limit` of its own acts at once.
+    sees. Blocks that it has more of stand between its parent's and pass on what they are given,
+    until training gives them something to add: messages then come from farther. A `crowding_limit`
+    of its own acts at once.
 
     Args:
         start_from: a shipped model or a checkpoint folder.
@@ -77,7 +80,29 @@ def inherit(model: LearnedModel, start_from: str) -> None:
             state[_FIRST.format(what)] = torch.stack(
                 [columns.get(name, torch.zeros_like(weight[:, 0])) for name in own], dim=1
             )
+    if mine.blocks > theirs.blocks:
+        state = _deepen(state, model, theirs.blocks)
     model.load_state_dict(state)
+
+
+def _deepen(state: dict[str, Tensor], model: LearnedModel, known: int) -> dict[str, Tensor]:
+    """`state` with its `known` blocks spread evenly over those of `model`.
+
+    The others keep the weights that they were drawn with, but for the LayerNorms at their ends, of
+    zero: their messages and updates are nothing, and the residuals hand on what came in.
+    """
+    blocks = model.config.blocks
+    places = [k * blocks // known for k in range(known)]
+    deeper = {name: value for name, value in state.items() if not name.startswith(_BLOCK)}
+    for name, value in model.state_dict().items():
+        if not name.startswith(_BLOCK):
+            continue
+        place, rest = name.removeprefix(_BLOCK).split(".", 1)
+        if int(place) in places:
+            deeper[name] = state[f"{_BLOCK}{places.index(int(place))}.{rest}"]
+        else:
+            deeper[name] = torch.zeros_like(value) if ".norm." in name else value
+    return deeper
 
 
 def _shorten(columns: dict[str, Tensor], mine: ModelConfig, theirs: ModelConfig) -> None:
@@ -157,6 +182,15 @@ def _check(mine: ModelConfig, theirs: ModelConfig, name: str, *, similar: bool) 
             raise RecipeError(
                 f"start_from = {name!r}: its {key} is {found[key]!r}, the recipe's {value!r}"
             )
+    if mine.blocks < theirs.blocks:
+        raise RecipeError(
+            f"start_from = {name!r}: it has {theirs.blocks} blocks, the recipe's only {mine.blocks}"
+        )
+    if mine.blocks > theirs.blocks and mine.edge_update == "doubled":
+        raise RecipeError(
+            f"start_from = {name!r}: blocks with edge_update = 'doubled' hand nothing on as it is, "
+            f"so the recipe's {mine.blocks} cannot begin as its {theirs.blocks}"
+        )
     if theirs.depth_range and mine.depth_range != theirs.depth_range:
         raise RecipeError(
             f"start_from = {name!r}: its depth_range is {theirs.depth_range:g}, the recipe's "

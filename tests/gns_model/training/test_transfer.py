@@ -114,6 +114,30 @@ def test_a_longer_history_changes_nothing_at_first(tmp_path, slides):
         )
 
 
+@pytest.mark.parametrize("blocks", [3, 4, 5])
+def test_a_deeper_network_changes_nothing_at_first(tmp_path, slides, blocks):
+    given = batch(slides)
+    model = build()
+    folder = save_model(tmp_path / "parent", model)
+    child = build(seed=1, blocks=blocks)
+    inherit(child, str(folder))
+    with torch.no_grad():
+        before = model.step(given.history, given.world)
+        after = child.step(given.history, given.world)
+    torch.testing.assert_close(after, before, rtol=0, atol=1e-7)
+    # But every block learns: what is zero at its end has a gradient.
+    child.acceleration(given.history, given.world).square().mean().backward()
+    norms = [block.vertex.norm.weight for block in child.network.blocks]
+    assert sum(bool((norm == 0).all()) for norm in norms) == blocks - 2
+    assert all((norm.grad.abs() > 0).any() for norm in norms)
+
+
+def test_blocks_that_double_their_edges_cannot_be_added(tmp_path):
+    folder = save_model(tmp_path / "parent", build(edge_update="doubled"))
+    with pytest.raises(RecipeError, match="recipe's 4 cannot begin as its 2"):
+        inherit(build(edge_update="doubled", blocks=4), str(folder))
+
+
 def test_features_that_the_parent_knows_keep_their_weights_in_any_order(tmp_path, slides):
     given = batch(slides)
     model = build(material_features=("tan_friction_angle",))
@@ -132,6 +156,7 @@ def test_features_that_the_parent_knows_keep_their_weights_in_any_order(tmp_path
         ({"latent": 16}, "its latent is 8, the recipe's 16"),
         ({"radius": 0.11}, "its radius is 0.1, the recipe's 0.11"),
         ({"baffles": "none"}, "baffles"),
+        ({"blocks": 1}, "it has 2 blocks, the recipe's only 1"),
     ],
 )
 def test_another_architecture_is_refused_in_one_line(parent, changes, words):
