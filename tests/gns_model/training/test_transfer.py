@@ -44,6 +44,14 @@ def batch(slides):
     )
 
 
+def assert_one_step(child, model, given):
+    """Both move the points of a batch alike."""
+    with torch.no_grad():
+        before = model.step(given.history, given.world)
+        after = child.step(given.history, given.world)
+    torch.testing.assert_close(after, before, rtol=0, atol=1e-7)
+
+
 def test_weights_and_normalisation_are_copied(parent):
     folder, model = parent
     child = build(seed=1, noise_std=1e-5)
@@ -70,10 +78,7 @@ def test_new_features_change_nothing_at_first(tmp_path, slides, types, more, new
     folder = save_model(tmp_path / "parent", model)
     child = build(seed=1, types=types, **more)
     inherit(child, str(folder))
-    with torch.no_grad():
-        before = model.step(given.history, given.world)
-        after = child.step(given.history, given.world)
-    torch.testing.assert_close(after, before, rtol=0, atol=1e-7)
+    assert_one_step(child, model, given)
     # But they can be learned: their weights have gradients.
     child.acceleration(given.history, given.world).square().mean().backward()
     first = child.network.encode_vertex.layers[0].weight
@@ -121,10 +126,7 @@ def test_a_deeper_network_changes_nothing_at_first(tmp_path, slides, blocks):
     folder = save_model(tmp_path / "parent", model)
     child = build(seed=1, blocks=blocks)
     inherit(child, str(folder))
-    with torch.no_grad():
-        before = model.step(given.history, given.world)
-        after = child.step(given.history, given.world)
-    torch.testing.assert_close(after, before, rtol=0, atol=1e-7)
+    assert_one_step(child, model, given)
     # But every block learns: what is zero at its end has a gradient.
     child.acceleration(given.history, given.world).square().mean().backward()
     norms = [block.vertex.norm.weight for block in child.network.blocks]
