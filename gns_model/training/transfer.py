@@ -80,9 +80,7 @@ def inherit(model: LearnedModel, start_from: str) -> None:
             state[_FIRST.format(what)] = torch.stack(
                 [columns.get(name, torch.zeros_like(weight[:, 0])) for name in own], dim=1
             )
-    if mine.blocks > theirs.blocks:
-        state = _deepen(state, model, theirs.blocks)
-    model.load_state_dict(state)
+    model.load_state_dict(_deepen(state, model, theirs.blocks))
 
 
 def _deepen(state: dict[str, Tensor], model: LearnedModel, known: int) -> dict[str, Tensor]:
@@ -91,17 +89,15 @@ def _deepen(state: dict[str, Tensor], model: LearnedModel, known: int) -> dict[s
     The others keep the weights that they were drawn with, but for the LayerNorms at their ends, of
     zero: their messages and updates are nothing, and the residuals hand on what came in.
     """
-    blocks = model.config.blocks
-    places = [k * blocks // known for k in range(known)]
+    origin = {str(k * model.config.blocks // known): k for k in range(known)}
     deeper = {name: value for name, value in state.items() if not name.startswith(_BLOCK)}
-    for name, value in model.state_dict().items():
-        if not name.startswith(_BLOCK):
-            continue
-        place, rest = name.removeprefix(_BLOCK).split(".", 1)
-        if int(place) in places:
-            deeper[name] = state[f"{_BLOCK}{places.index(int(place))}.{rest}"]
-        else:
-            deeper[name] = torch.zeros_like(value) if ".norm." in name else value
+    for name, drawn in model.state_dict().items():
+        if name.startswith(_BLOCK):
+            place, rest = name.removeprefix(_BLOCK).split(".", 1)
+            if place in origin:
+                deeper[name] = state[f"{_BLOCK}{origin[place]}.{rest}"]
+            else:
+                deeper[name] = torch.zeros_like(drawn) if ".norm." in name else drawn
     return deeper
 
 
