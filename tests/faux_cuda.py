@@ -177,3 +177,10 @@ def faux_cuda() -> Iterator[None]:
         torch._C._set_only_lift_cpu_tensors(True)
         stack.enter_context(_Device())
         yield
+
+
+def on_both(run: Callable[[str], Any]) -> tuple[Any, Any]:
+    """What `run`, given the name of a device, makes on the CPU and on the stand-in."""
+    here = run("cpu")
+    with faux_cuda():
+        return here, run("cuda")

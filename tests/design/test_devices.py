@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
-
 import gymnasium
 import numpy as np
 import pytest
@@ -12,7 +10,7 @@ import design
 import gns_env  # noqa: F401  registers the env
 from gns_env.task import BaffleTask
 from gns_model import Scene, load_simulator
-from tests.faux_cuda import faux_cuda
+from tests.faux_cuda import on_both
 
 
 @pytest.fixture(scope="module")
@@ -32,18 +30,18 @@ def flow() -> Scene:
 @pytest.mark.slow
 def test_a_step_of_the_env_and_the_gradient_of_a_layout_are_those_of_the_cpu(flow):
     layout = np.array([[0.33, 0.16], [0.36, 0.33]])
-    costs, gradients, rewards = [], [], []
-    for device in ("cpu", "cuda"):
-        with faux_cuda() if device == "cuda" else nullcontext():
-            simulator = load_simulator("baffle-lite", device=device)
-            task = BaffleTask(flow, simulator, n_baffles=2)
-            cost, gradient = design.cost_and_gradient(task, layout)
-            env = gymnasium.make("GranularBaffle-v0", scene=flow, simulator=simulator, n_baffles=2)
-            env.reset(seed=0)
-            rewards.append(env.step(np.zeros_like(env.action_space.sample()))[1])
-        costs.append(cost)
-        gradients.append(gradient)
-    assert costs[1] == pytest.approx(costs[0], abs=1e-5)
-    np.testing.assert_allclose(gradients[1], gradients[0], rtol=1e-2, atol=1e-4)
-    assert np.abs(gradients[0]).max() > 1e-3
-    assert rewards[1] == pytest.approx(rewards[0], abs=1e-5)
+
+    def run(device: str) -> tuple[float, np.ndarray, float]:
+        simulator = load_simulator("baffle-lite", device=device)
+        task = BaffleTask(flow, simulator, n_baffles=2)
+        cost, gradient = design.cost_and_gradient(task, layout)
+        env = gymnasium.make("GranularBaffle-v0", scene=flow, simulator=simulator, n_baffles=2)
+        env.reset(seed=0)
+        reward = env.step(np.zeros_like(env.action_space.sample()))[1]
+        return cost, gradient, reward
+
+    here, there = on_both(run)
+    assert there[0] == pytest.approx(here[0], abs=1e-5)
+    np.testing.assert_allclose(there[1], here[1], rtol=1e-2, atol=1e-4)
+    assert np.abs(here[1]).max() > 1e-3
+    assert there[2] == pytest.approx(here[2], abs=1e-5)

@@ -7,7 +7,6 @@ arithmetic is the CPU's: so what comes out is what comes out on the CPU.
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,7 @@ from gns_model.scene import Scene
 from gns_model.smooth_measures import smooth_measures
 from gns_model.training import Recipe, train
 from gns_model.trajectory import Trajectory
-from tests.faux_cuda import FauxCuda, faux_cuda
+from tests.faux_cuda import FauxCuda, faux_cuda, on_both
 
 MODELS: dict[str, dict[str, Any]] = {
     "as baffle-lite": {},
@@ -89,19 +88,6 @@ def model(dim: int, options: dict[str, Any]) -> LearnedModel:
     )
 
 
-def on(device: str) -> AbstractContextManager[None]:
-    return faux_cuda() if device == "cuda" else nullcontext()
-
-
-def both(run: Callable[[str], Any]) -> tuple[Any, Any]:
-    """What `run` gives on the CPU and on the stand-in."""
-    found = []
-    for device in ("cpu", "cuda"):
-        with on(device):
-            found.append(run(device))
-    return found[0], found[1]
-
-
 def refused(act: Callable[[], object]) -> bool:
     try:
         act()
@@ -144,7 +130,7 @@ def test_a_rollout(dim, name):
         simulator = LearnedSimulator(model(dim, MODELS[name]).to(device))
         return simulator.rollout([scene(dim), scene(dim).replace(duration=0.06)])[0].positions
 
-    here, there = both(run)
+    here, there = on_both(run)
     np.testing.assert_allclose(there, here, rtol=0, atol=1e-6)
 
 
@@ -154,7 +140,7 @@ def test_a_rollout_in_bfloat16():
             [scene(3)]
         )[0]
 
-    here, there = both(run)
+    here, there = on_both(run)
     assert there.status == here.status == "ok"
     np.testing.assert_allclose(there.positions, here.positions, rtol=0, atol=2e-3)
 
@@ -175,7 +161,7 @@ def test_a_gradient_through_a_rollout(dim, name):
         sum(found.values()).backward()
         return [*centres.grad.tolist(), speed.grad.tolist()]
 
-    here, there = both(run)
+    here, there = on_both(run)
     for one, two in zip(here, there, strict=True):
         np.testing.assert_allclose(two, one, rtol=1e-3, atol=1e-5)
     assert np.abs(here[-1]).sum() > 0
@@ -191,7 +177,7 @@ def test_one_step_from_arrays(dim):
         simulator = LearnedSimulator(model(dim, options).to(device))
         return np.asarray(simulator.predict_positions(history, material=0.5))
 
-    here, there = both(run)
+    here, there = on_both(run)
     np.testing.assert_allclose(there, here, rtol=0, atol=1e-6)
 
 
@@ -203,7 +189,7 @@ def test_the_torch_solver(dim):
         solver = TorchMpmSimulator(spacing=0.05, frame_interval=0.02, device=device)
         return solver.rollout([flow] * 2)[1].positions
 
-    here, there = both(run)
+    here, there = on_both(run)
     np.testing.assert_array_equal(there, here)
 
 
@@ -216,7 +202,7 @@ def test_generate_writes_the_same_flows(tmp_path):
         assert found.exit_code == 0, found.output
         return [Trajectory.load(file) for file in sorted(out.glob("*.h5"))]
 
-    here, there = both(run)
+    here, there = on_both(run)
     assert len(here) == len(there) == 2
     for one, two in zip(here, there, strict=True):
         np.testing.assert_array_equal(two.positions, one.positions)
@@ -243,7 +229,7 @@ def test_training_makes_the_same_weights_and_goes_on_from_its_checkpoint(name, f
             train(Recipe.from_dict({**values, "device": device, "steps": steps}), out)
         return load_file(out / "state.safetensors")
 
-    here, there = both(run)
+    here, there = on_both(run)
     assert here.keys() == there.keys()
     for key, value in here.items():
         torch.testing.assert_close(there[key], value, rtol=1e-3, atol=1e-5, msg=key)
