@@ -170,6 +170,9 @@ def generate(
     jitter: Annotated[
         float, typer.Option(min=0.0, help="Starts off their lattice by up to so many spacings.")
     ] = 0.0,
+    points: Annotated[
+        str | None, typer.Option(help="least:most, only scenes of as many points, e.g. :3000.")
+    ] = None,
     solver: Annotated[
         Solver | None,
         typer.Option(help="Engine of the solver.", show_default="numba; on a GPU torch"),
@@ -183,8 +186,10 @@ def generate(
 ) -> None:
     """Make training data with the reference solver; a rerun goes on where it stopped."""
     from gns_model.data.generate import generate as run
-    from gns_model.data.generate import parse_shard
+    from gns_model.data.generate import parse_points, parse_shard
 
+    part = parse_shard(shard)
+    sizes = None if points is None else parse_points(points)
     with console.progress_bar(quiet=quiet) as bar:
         task = bar.add_task(f"{family.value} scenes", total=count)
         paths = run(
@@ -195,11 +200,12 @@ def generate(
             spacing=spacing,
             frame_interval=frame_interval,
             jitter=jitter,
+            points=sizes,
             workers=workers,
             solver=solver and solver.value,
             device=device,
             batch=batch,
-            shard=parse_shard(shard),
+            shard=part,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     print(f"{len(paths)} trajectories in {out}")

@@ -11,13 +11,16 @@ columns. So this makes the paper's dataset of barriers on a GPU machine:
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from gns_model.data.scenes import draw
-from gns_model.errors import FileFormatError, GnsError, SimulatorError
+from gns_model.errors import FileFormatError, GnsError, SceneError, SimulatorError
+from gns_model.mpm.problem import DEFAULT_SPACING
+from gns_model.particles import fill
 from gns_model.scene import Scene
 from gns_model.trajectory import open_trajectory
 
@@ -45,6 +48,24 @@ def parse_shard(text: str) -> tuple[int, int]:
     return part, parts
 
 
+def parse_points(text: str) -> tuple[int, float]:
+    """Read "least:most", numbers of points; either may be left out.
+
+    Raises:
+        GnsError: if it is anything else.
+    """
+    try:
+        least, most = text.split(":")
+        bounds = int(least or 0), int(most) if most else math.inf
+        if not 0 <= bounds[0] <= bounds[1]:
+            raise ValueError
+    except ValueError:
+        raise GnsError(
+            f"--points {text!r}: give least:most, such as 500:3000, :3000 or 500:"
+        ) from None
+    return bounds
+
+
 def generate(
     out: str | os.PathLike[str],
     *,
@@ -54,6 +75,7 @@ def generate(
     spacing: float | None = None,
     frame_interval: float = 0.01,
     jitter: float = 0.0,
+    points: tuple[int, float] | None = None,
     workers: int = 1,
     solver: str | None = None,
     device: str = "cpu",
@@ -61,7 +83,7 @@ def generate(
     shard: tuple[int, int] = (0, 1),
     progress: Callable[[float, int], None] | None = None,
 ) -> list[Path]:
-    """Run scenes `0..count-1` of a family through the reference solver, one file each.
+    """Run the first `count` scenes of a family through the reference solver, one file each.
 
     Files that are there already are checked and kept, so a rerun continues; each file is written
     under a temporary name and renamed, so an interrupt leaves no half file.
@@ -75,6 +97,7 @@ def generate(
         frame_interval: between stored frames [s].
         jitter: how far the points of a start are moved off their lattice at random, in spacings,
             every scene's in its own way; see `mpm.problem.Discretisation`.
+        points: (least, most): only scenes of as many points, the first `count` of the family.
         workers: processes of the numba solver, one thread each.
         solver: "numba" or "torch"; default: what suits the device. Files agree within round-off.
         device: "cpu", or for the torch solver "cuda".
@@ -88,6 +111,7 @@ def generate(
     Raises:
         FileFormatError: if a file that is there is truncated, foreign or of another dataset.
         SimulatorError: if there is no such solver or device, or a batch does not fit on it.
+        SceneError: if hardly any scene of the family has so many points.
     """
     if solver is None:
         solver = "numba" if device == "cpu" else "torch"
@@ -98,7 +122,7 @@ def generate(
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     part, parts = shard
-    indices = range(part, count, parts)
+    indices = _first(count, family, seed, spacing, points)[part::parts]
     paths = {index: out / file_name(family, seed, index) for index in indices}
     settings = {"spacing": spacing, "frame_interval": frame_interval, "jitter": jitter}
     missing = [i for i, path in paths.items() if not _is_there(path, family, seed, i, settings)]
@@ -124,6 +148,34 @@ def generate(
     else:
         _by_batches(todo, batch, settings, device, report)
     return list(paths.values())
+
+
+#: Draws in search of one scene that has as many points as asked for.
+DRAWS = 100
+
+
+def _first(
+    count: int,
+    family: str,
+    seed: int,
+    spacing: float | None,
+    points: tuple[int, float] | None,
+) -> Sequence[int]:
+    """Indices of the first `count` scenes of a family that have as many points."""
+    if points is None:
+        return range(count)
+    found: list[int] = []
+    for index in range(DRAWS * count):
+        scene = draw(family, seed, index)
+        size = len(fill(scene, spacing or DEFAULT_SPACING[scene.dim]).positions)
+        if points[0] <= size <= points[1]:
+            found.append(index)
+        if len(found) == count:
+            return found
+    raise SceneError(
+        f"only {len(found)} of the first {DRAWS * count} scenes of {family} have {points[0]} to "
+        f"{points[1]} points: ask for fewer, or for a wider range"
+    )
 
 
 def _by_batches(

@@ -21,7 +21,7 @@ import json
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import h5py
@@ -66,6 +66,16 @@ class Window:
         if self.tan_friction is None:
             tangent = math.tan(math.radians(self.scene.material.friction_angle))
             object.__setattr__(self, "tan_friction", np.full(points, tangent, np.float32))
+
+    def reordered(self, order: np.ndarray) -> Window:
+        """The same with its points in another order, shape (N,)."""
+        return replace(
+            self,
+            history=self.history[order],
+            future=self.future[order],
+            particle_type=self.particle_type[order],
+            tan_friction=self.tan_friction[order],
+        )
 
 
 @dataclass(frozen=True)

@@ -106,6 +106,9 @@ class Recipe(BaseModel):
     replay_memory: Annotated[int, Field(ge=0)] = 0
     #: `relative_to` of their states, whose way back would drown the rest; none: as of all others.
     replay_relative_to: Positive | None = None
+    #: Ask them back to where true grains are, whichever grain is which, and not every grain to its
+    #: own place, which takes the tip off a front; see `exchange`.
+    replay_exchange: bool = False
     #: Share of the steps that are about them; the others look at true states and keep them right.
     replay_share: Fraction = 0.5
     #: Share of the steps of the unrolled phase, taken before that of `replay`, that train through

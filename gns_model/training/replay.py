@@ -44,12 +44,16 @@ from gns_model.files import write_whole
 from gns_model.training import batches
 from gns_model.training.batches import Batch, Draw
 from gns_model.training.distributed import Ranks
+from gns_model.training.exchange import least_way_back
 from gns_model.training.kinematic import kinematic_spacing
 from gns_model.training.recipe import Recipe
 from gns_model.training.statistics import Statistics
 
 #: A flow whose points have strayed this far on average is let go [spacings].
 ASTRAY = 6.0
+#: Steps of a flow after which its grains are paired anew; a pairing of a thousand takes some tenths
+#: of a second.
+EXCHANGE = 8
 
 
 @dataclass
@@ -60,11 +64,13 @@ class Rolling:
         draw: its source, mixture of tracers and present frame.
         left: steps until it is let go.
         history: the model's positions [m], shape (N, H+1, D); None: it begins with the true ones.
+        order: the true point that each of the model's is compared with, shape (N,); None: itself.
     """
 
     draw: Draw
     left: int
     history: np.ndarray | None = None
+    order: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -74,10 +80,12 @@ class Memory:
     Attributes:
         draw: its source, mixture of tracers and frame.
         history: the model's positions [m], shape (N, H+1, D).
+        order: as of `Rolling`.
     """
 
     draw: Draw
     history: np.ndarray
+    order: np.ndarray | None = None
 
 
 class Replay:
@@ -115,7 +123,7 @@ class Replay:
             if self._taken and edges + flow.draw.edges / 2 > recipe.edges_per_batch:
                 break
             edges += flow.draw.edges
-            truth = batches.read(self._data, flow.draw, unroll=1, kinematic=self._kinematic)
+            truth = self._truth(flow.draw, flow.order)
             if flow.history is None:
                 rng = self._rng(batches.NOISE, step, len(self._taken))
                 flow.history = _noisy(truth, recipe.model.noise_std, rng)
@@ -135,8 +143,11 @@ class Replay:
             if states and edges + memory.draw.edges / 2 > self._recipe.edges_per_batch:
                 return self._asked(states), edges
             edges += memory.draw.edges
-            truth = batches.read(self._data, memory.draw, unroll=1, kinematic=self._kinematic)
-            states.append((memory.history, truth))
+            states.append((memory.history, self._truth(memory.draw, memory.order)))
+
+    def _truth(self, draw: Draw, order: np.ndarray | None) -> Window:
+        truth = batches.read(self._data, draw, unroll=1, kinematic=self._kinematic)
+        return truth if order is None else truth.reordered(order)
 
     def _asked(self, states: list[tuple[np.ndarray, Window]]) -> Batch:
         """The model's histories with what is asked of them."""
@@ -175,9 +186,19 @@ class Replay:
                 continue
             history = np.concatenate([flow.history[:, 1:], now[:, None]], axis=1)
             draw = dataclasses.replace(flow.draw, frame=frame)
-            flows.append(Rolling(draw, flow.left - 1, history))
-            self._remember(Memory(draw, history))
+            order = self._paired(flow, draw, history)
+            flows.append(Rolling(draw, flow.left - 1, history, order))
+            self._remember(Memory(draw, history, order))
         self.flows, self._after = flows, None
+
+    def _paired(self, flow: Rolling, draw: Draw, history: np.ndarray) -> np.ndarray | None:
+        """The order of a flow after a step of it."""
+        if not self._recipe.replay_exchange or flow.left % EXCHANGE:
+            return flow.order
+        order = np.arange(len(history), dtype=np.int32) if flow.order is None else flow.order
+        return least_way_back(
+            history, self._truth(draw, None), order, self._recipe.return_steps or 1.0
+        )
 
     def _remember(self, memory: Memory) -> None:
         room = self._recipe.replay_memory
@@ -194,6 +215,9 @@ class Replay:
         """Write the flows whole, beside the state of the same step."""
         tensors = {str(k): f.history for k, f in enumerate(self.flows) if f.history is not None}
         tensors |= {f"memory-{k}": m.history for k, m in enumerate(self.memories)}
+        orders = {f"order-{k}": f.order for k, f in enumerate(self.flows)}
+        orders |= {f"memory-order-{k}": m.order for k, m in enumerate(self.memories)}
+        tensors |= {name: order for name, order in orders.items() if order is not None}
         about = [[dataclasses.asdict(f.draw), f.left] for f in self.flows]
         metadata = {
             "step": str(step),
@@ -219,11 +243,11 @@ class Replay:
             if int(metadata["step"]) != step or metadata["data"] != self._data_told:
                 return
             flows = [
-                Rolling(Draw(**draw), left, tensors.get(str(k)))
+                Rolling(Draw(**draw), left, tensors.get(str(k)), tensors.get(f"order-{k}"))
                 for k, (draw, left) in enumerate(json.loads(metadata["flows"]))
             ]
             memories = [
-                Memory(Draw(**draw), tensors[f"memory-{k}"])
+                Memory(Draw(**draw), tensors[f"memory-{k}"], tensors.get(f"memory-order-{k}"))
                 for k, draw in enumerate(json.loads(metadata["memories"]))
             ]
             drawn, remembered = int(metadata["drawn"]), int(metadata["remembered"])

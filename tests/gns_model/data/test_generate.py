@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from gns_model import cli, console
-from gns_model.data.generate import file_name, generate
-from gns_model.errors import FileFormatError, GnsError, SimulatorError
+from gns_model.data.generate import file_name, generate, parse_points
+from gns_model.errors import FileFormatError, GnsError, SceneError, SimulatorError
 from gns_model.trajectory import Trajectory
 
 WANTED = {"family": "barriers", "count": 3, "seed": 4, "spacing": 0.1, "frame_interval": 0.02}
@@ -149,3 +149,27 @@ def test_ctrl_c_ends_the_command_at_once_and_keeps_whole_files(tmp_path):
     paths = list(out.glob("*.h5"))
     assert 1 <= len(paths) < 500
     assert all(Trajectory.load(path).status == "ok" for path in paths)
+
+
+def test_only_scenes_of_as_many_points_as_asked_for(tmp_path):
+    """They keep their numbers, so a dataset of small flows is a part of the whole one."""
+    coarse = {**WANTED, "count": 4}
+    every = [len(Trajectory.load(p).positions[0]) for p in generate(tmp_path / "all", **coarse)]
+    bounds = (sorted(every)[1], sorted(every)[2])
+    wanted = {**coarse, "count": 2, "points": bounds}
+    paths = generate(tmp_path / "some", **wanted, workers=1)
+    within = [k for k, points in enumerate(every) if bounds[0] <= points <= bounds[1]][:2]
+    assert [p.name for p in paths] == [file_name("barriers", 4, k) for k in within]
+    parts = [generate(tmp_path / "some", **wanted, shard=(k, 2)) for k in range(2)]
+    assert sorted(parts[0] + parts[1]) == sorted(paths)
+    with pytest.raises(SceneError, match="only 0 of the first 100 scenes of barriers have 1 to 2"):
+        generate(tmp_path / "none", **{**wanted, "count": 1, "points": (1, 2)})
+
+
+def test_a_range_of_points_is_read_or_refused_in_one_line():
+    assert parse_points("500:3000") == (500, 3000)
+    assert parse_points(":3000") == (0, 3000)
+    assert parse_points("500:") == (500, np.inf)
+    for text in ("3000", "3000:500", "a:b", "1:2:3", "-1:5", ""):
+        with pytest.raises(GnsError, match="give least:most"):
+            parse_points(text)

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from gns_model.data.windows import Window
 from gns_model.learned.model import LearnedModel
 from gns_model.training import Recipe, RecipeError
+from gns_model.training import replay as replay_module
 from gns_model.training.distributed import session
 from gns_model.training.loss import step_error
 from gns_model.training.replay import Replay, wish
@@ -243,3 +244,33 @@ def test_flows_of_other_data_begin_again(flight, free_scene, tmp_path):
     assert len(moved.memories) == len(replay.memories) > 0
     assert (changed.flows, changed.memories) == ([], [])
     assert np.isfinite(advance(changed, net, 3))
+
+
+def test_grains_that_trade_places_are_asked_nothing_if_the_recipe_says_so(flight, tmp_path):
+    """All grains of a flow swapped in pairs: with `replay_exchange` they stand for each other from
+    the next pairing on, and a file keeps that."""
+    recipe, data, statistics, net = flight
+    found = {}
+    for exchange in (False, True):
+        wanted = recipe.model_copy(
+            update={"replay_exchange": exchange, "replay": 1, "replay_memory": 4}
+        )
+        with session("cpu") as ranks:
+            replay, other = (Replay(data, wanted, statistics, ranks) for _ in range(2))
+        replay.take(0)
+        first = dataclasses.replace(replay.flows[0].draw, frame=0)
+        replay.flows[0] = replay_module.Rolling(first, replay_module.EXCHANGE)
+        batch, _ = replay.take(0)
+        traded = np.random.default_rng(0).permutation(len(batch.history))
+        moved = batch.history[torch.from_numpy(traded)]
+        replay.flows[0].history = moved.numpy()
+        replay.advanced(net.step(moved, batch.world))
+        replay.keep()
+        replay.save(tmp_path, 1)
+        other.restore(tmp_path, 1)
+        for one in (replay, other):
+            back = one.take(1)[0].back
+            found[exchange] = float(back.abs().max())
+            assert found[exchange] == pytest.approx(float(one.recall(1)[0].back.abs().max()))
+    assert found[True] < 1e-6
+    assert found[False] > 1e-3
