@@ -122,7 +122,7 @@ def generate(
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     part, parts = shard
-    indices = _first(count, family, seed, spacing, points)[part::parts]
+    indices = select(count, family, seed, spacing, points)[part::parts]
     paths = {index: out / file_name(family, seed, index) for index in indices}
     settings = {"spacing": spacing, "frame_interval": frame_interval, "jitter": jitter}
     missing = [i for i, path in paths.items() if not _is_there(path, family, seed, i, settings)]
@@ -154,14 +154,18 @@ def generate(
 DRAWS = 100
 
 
-def _first(
+def select(
     count: int,
     family: str,
     seed: int,
     spacing: float | None,
     points: tuple[int, float] | None,
 ) -> Sequence[int]:
-    """Indices of the first `count` scenes of a family that have as many points."""
+    """Indices of the first `count` scenes of a family with (least, most) points at `spacing`.
+
+    Raises:
+        SceneError: if hardly any scene of the family has so many.
+    """
     if points is None:
         return range(count)
     found: list[int] = []
