@@ -76,6 +76,7 @@ class Recipe(BaseModel):
     momentum_weight: NonNegative = 0.0
     local_weight: NonNegative = 0.0  #: likewise of the mean error of a cell of some grains
     front_weight: NonNegative = 0.0  #: likewise of the front of a scene
+    tip_weight: NonNegative = 0.0  #: likewise of the tip of that
     strain_weight: NonNegative = 0.0  #: likewise of how the error strains a scene and its cells
     #: Errors count relative to what accelerates their scene, this much more [standard deviations].
     relative_to: Positive | None = None

@@ -13,7 +13,7 @@ from gns_model.data.windows import WindowIndex
 from gns_model.learned.config import ModelConfig
 from gns_model.learned.model import LearnedModel
 from gns_model.training.batches import collate
-from gns_model.training.loss import CELL, FRONT, Emphasis, step_error, unrolled_loss
+from gns_model.training.loss import CELL, FRONT, TIP, Emphasis, step_error, unrolled_loss
 from gns_model.training.statistics import measure
 
 SPACING, DT = 0.0625, 0.02
@@ -149,7 +149,8 @@ def test_an_error_that_neighbours_share_weighs_more(free_flight):
     assert cost(by_grain, 3.0) == pytest.approx(1, rel=1e-2)
 
 
-def test_an_error_of_the_front_weighs_more(free_flight):
+@pytest.mark.parametrize(("name", "part"), [("front_weight", FRONT), ("tip_weight", TIP)])
+def test_an_error_of_the_front_weighs_more(name, part, free_flight):
     """The same error in as many points: at the front of one of two scenes, and anywhere in it."""
     net, batch = ballistic(free_flight)
     history, move = batch.history.clone(), batch.moves[:, 0]
@@ -157,11 +158,11 @@ def test_an_error_of_the_front_weighs_more(free_flight):
     scene = torch.arange(len(history)) % 2
     scale = DT**2 * net.acceleration_std
     place = history[:, -1, 0].where(scene == 0, -1.0)
-    count = 1 + int(FRONT * int((scene == 0).sum()))
+    count = 1 + int(part * int((scene == 0).sum()))
     order = place.argsort(descending=True)
 
     def cost(rows, weight):
-        emphasis = Emphasis(front_weight=weight)
+        emphasis = Emphasis(**{name: weight})
         error = torch.zeros(len(history))
         error[rows] = 1.0
         after = history[:, -1] + move + error[:, None] * scale
