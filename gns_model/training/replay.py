@@ -14,6 +14,9 @@ damped: with e(t) = x - x_true of a point and tau = `return_steps` dt,
 Asking for the true place in the next step instead would ask for accelerations of e/dt², which are
 tens of g for the wanderings of single grains that nobody can foretell.
 
+With `replay_exchange` x_true is not the place of the same grain but of one that stands for it
+(`exchange`), so that grains of one kind may trade places.
+
 The way back closes a control loop, and the pool is its delay: what the weights of now do wrong
 shows at the end of a flow, after `replay_steps` turns of that flow. So keep few flows, about as
 many as a batch holds.
