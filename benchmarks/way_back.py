@@ -27,6 +27,7 @@ from gns_model.data.windows import Window
 from gns_model.errors import GnsError
 from gns_model.learned.simulator import LearnedSimulator
 from gns_model.training.exchange import least_way_back
+from gns_model.training.loss import TIP
 from gns_model.trajectory import Trajectory
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -38,7 +39,6 @@ parser.add_argument("--seed", type=int, default=1)
 parser.add_argument("--return-steps", type=float, default=16.0)
 
 TIMES = (0.2, 0.4, 0.6)  # s
-TIP = 0.02
 
 
 def ways(true: Trajectory, rolled: Trajectory, frame: int, back: float) -> list[float]:
